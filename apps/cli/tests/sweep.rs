@@ -208,7 +208,11 @@ fn plans_are_by_content_and_mistakes_are_named() {
     let sized = GRID.replace("iterations = 90", "minutes = 2.0").replace("family = 'demo'", "").replace("preset = '+none'", "preset = '+none'\nsize = 3.0");
     let said = plan(&sized, "wrong").unwrap_err();
     assert!(said.contains("has 6 minutes") && said.contains("scene.width"), "{said}");
-    std::fs::write(folder.path().join("sized.toml"), sized.replace("images = 1", "images = 1\nset = ['scene.width=40']")).unwrap();
+    std::fs::write(
+        folder.path().join("sized.toml"),
+        sized.replace("images = 1", "images = 1\nset = ['scene.width=40', 'density.max_gaussians=500', 'appearance.lr=0.001']"),
+    )
+    .unwrap();
     assert_eq!(succeed(&["sweep", "plan", text(&folder.path().join("sized.toml"))])["minutes"], 8.0, "sizes count");
     let out = folder.path().join("a");
     assert!(fail(&["sweep", "run", text(&out), "--index", "2"], 2).contains("the plan has 2"));

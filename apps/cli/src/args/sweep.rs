@@ -17,7 +17,7 @@ pub enum SweepWhat {
     Run(SweepRun),
     /// Check that every cell is there, and write the tables.
     Collect(SweepCollect),
-    /// Print a job file for a scheduler: each index runs one training with its cells, on --threads threads (one by default).
+    /// Print a job file for a scheduler: each index runs one training with its cells, on --threads threads (one by default) and with the --limit options given here.
     Emit(SweepEmit),
 }
 
@@ -115,7 +115,7 @@ pub struct SweepEmit {
     /// Time limit of a job in minutes. A job that reaches it leaves a checkpoint and goes on later.
     #[arg(long, value_name = "M", default_value_t = 240)]
     pub time_limit: u32,
-    /// Jobs at a time; 0 leaves it to the scheduler.
+    /// Jobs at a time (slurm, k8s); 0 leaves it to the scheduler.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub parallel: usize,
     /// Container image (k8s).

@@ -269,6 +269,18 @@ fn training_curves(rows: &[Row], key: &Key, times: Option<&TrainingDevices>) -> 
     Plot { title: title.into(), x: Axis::linear(x), y: Axis::linear("PSNR of training views (dB)"), series, front: Vec::new(), note }
 }
 
+/// What stands below a plot of validation views where the trainings kept other numbers of views out: their lines are then of other views. Else nothing.
+fn views_note(rows: &[Row]) -> String {
+    let kept_out = |cell: &&CellResult| cell.provenance.configuration.pointer("/train/validation").map_or_else(|| "?".to_string(), ToString::to_string);
+    let of = |row: &&Row| -> BTreeSet<String> { row.cells.iter().filter(|cell| !cell.validation_curve.psnr_db.is_empty()).map(kept_out).collect() };
+    let counts: Vec<(String, BTreeSet<String>)> = trainings(rows).iter().map(|row| (row.training(), of(row))).filter(|(_, own)| !own.is_empty()).collect();
+    if counts.iter().flat_map(|(_, own)| own).collect::<BTreeSet<_>>().len() < 2 {
+        return String::new();
+    }
+    let named: Vec<String> = counts.iter().map(|(name, own)| format!("{name} {}", own.iter().cloned().collect::<Vec<_>>().join(", "))).collect();
+    format!("Lines of trainings with other numbers of validation views (train.validation) are of other views and do not compare: {}.", named.join("; "))
+}
+
 /// By time: of views that were kept out of the trainings, where some were.
 fn validation_curves(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Plot {
     let line = |cell: &CellResult| -> Vec<Point> {
@@ -282,7 +294,7 @@ fn validation_curves(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Plot
         y: Axis::linear("PSNR of validation views (dB)"),
         series: trainings(rows).iter().flat_map(of).collect(),
         front: Vec::new(),
-        note: device_note(rows, trained),
+        note: format!("{} {}", views_note(rows), device_note(rows, trained)).trim().into(),
     }
 }
 

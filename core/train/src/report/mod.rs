@@ -110,8 +110,19 @@ fn planned_results(folder: &Path) -> Result<(Vec<CellResult>, Option<String>)> {
     Ok((results, gap))
 }
 
+/// The folder that images are named relative to, which holds a folder `images`: that of the results, or the one around a sweep's folder of results.
+fn folder_of_images(path: &Path) -> &Path {
+    fn around(path: &Path) -> &Path {
+        path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+    }
+    let own = if path.is_file() { around(path) } else { path };
+    // The folder of a sweep may be called `results`, too.
+    let is_inner = own.file_name().is_some_and(|name| name == RESULTS) && !own.join("images").is_dir();
+    if is_inner { around(own) } else { own }
+}
+
 /// Makes the report of the results in `path` (see [`read_results`]); of a sweep's folder, those of the cells of its plan. The folder of images is `path` itself,
-/// the folder of a file, or that of a folder called `results`.
+/// or the folder of a file; if that is called `results` and has no images, the one around it.
 ///
 /// # Errors
 /// What reading reports; [`Error::Data`] for results that do not belong into one table, and for damaged images; [`Error::Parameter`] for options.
@@ -122,8 +133,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let results = select(results, &options.only)?;
     check_comparable(&results)?;
     let scenes = rows(&results)?;
-    let beside = path.is_file() || path.file_name().is_some_and(|name| name == RESULTS);
-    let folder = if beside { path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")) } else { path };
+    let folder = folder_of_images(path);
     let public = images::built_in(&scenes);
     let key = charts::Key::of(scenes.values().flatten());
     let columns = columns(&options.columns)?;
@@ -137,12 +147,14 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let mut links = anchors.clone();
     links.extend([("protocols".to_string(), "protocols".to_string()), ("published".to_string(), "reported by papers".to_string())]);
     let mut body = page::contents(&links) + &page::facts(&results);
+    let scored = page::scored(&results);
     let mut markdown = format!("# {}\n\n{MARKDOWN_NOTE} ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n", text::markdown(&title));
-    let mut latex = format!("{LATEX_NOTE} MB are 10^6 bytes.\n");
+    markdown += &format!("Scored on {}.\n\n", text::markdown(&scored));
+    let mut latex = format!("{LATEX_NOTE} MB are 10^6 bytes.\n% Scored on {}.\n", text::latex(&scored));
     if let Some(gap) = &gap {
         body += &format!("<p class=\"warning\">{}</p>\n", text::html(gap));
         markdown += &format!("{}\n\n", text::markdown(gap));
-        latex += &format!("% {gap}\n");
+        latex += &format!("% {}\n", text::latex(gap));
     }
     for (i, (scene, rows)) in scenes.iter().enumerate() {
         let table = tables::summary(scene, rows, &columns, &trained);

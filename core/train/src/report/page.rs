@@ -47,7 +47,7 @@ pub fn facts(results: &[CellResult]) -> String {
         ),
         ("program", set(&|r| format!("cc4dgs {}, commit {}", r.provenance.version, commit(r)))),
         ("device", set(&device)),
-        ("split", set(&|r| format!("{:?}", r.split).to_lowercase())),
+        ("scored", scored(results)),
         ("data", set(&data)),
     ];
     let trained = TrainingDevices::of(results).sentence();
@@ -59,6 +59,18 @@ pub fn facts(results: &[CellResult]) -> String {
         _ = writeln!(out, "<tr><th>{name}</th><td>{}</td></tr>", html(&value));
     }
     out + "</table>\n"
+}
+
+/// Which images are scored: the side of the split, and of each scene how many of its images.
+pub fn scored(results: &[CellResult]) -> String {
+    let all = |r: &CellResult| r.metrics.values().find_map(|score| score.protocol.get("frames")?.get("of")?.as_u64());
+    let of_scene = |r: &CellResult| {
+        let of = all(r).map_or_else(String::new, |count| format!(" of {count}"));
+        format!("{} {}{of} images", r.axes.scene, r.images.len())
+    };
+    let scenes: BTreeSet<String> = results.iter().map(of_scene).collect();
+    let split = results.first().map_or_else(String::new, |r| format!("{:?}", r.split).to_lowercase());
+    format!("{split} views: {}", scenes.into_iter().collect::<Vec<_>>().join("; "))
 }
 
 /// The protocol of every metric, from the results themselves.

@@ -1,6 +1,5 @@
 use super::*;
-use crate::sweep::{CellResult, Spread};
-use crate::sweep::{ImageResult, Outcome};
+use crate::sweep::{CellResult, DataFingerprint, ImageResult, Outcome, PlannedCell, PlannedTraining, ScoredViews, Spread};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -99,6 +98,9 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
     for wrong in ["NaN", "inf\"", "http://", "https://", "<link", "src=\"/"] {
         assert!(!first.html.contains(wrong), "{wrong}");
     }
+    for text in [&first.html, &first.markdown, &first.latex] {
+        assert!(text.contains("test views: tiny 3 of 20 images"), "{text}");
+    }
     // 4 rows; the mean of 31.0 and 31.2, the better of the two methods, is marked.
     assert_eq!(first.csv.lines().count(), 5);
     assert!(first.csv.lines().nth(3).unwrap().starts_with("tiny,hexplane,base,cca-default,done,2,31.1,"), "{}", first.csv);
@@ -140,6 +142,16 @@ fn scores_of_validation_views_are_drawn_where_there_are_some() {
     let (_, svg) = plot(&cells).unwrap();
     assert_eq!(svg.matches("class=\"line\"").count(), 2, "a line per seed, once for both codecs");
     assert!(svg.contains("cdf</text>") && !svg.contains("hexplane</text>"), "{svg}");
+    // Trainings that keep other numbers of views out are scored on other views.
+    for cell in &mut cells {
+        (cell.validation_curve.iteration, cell.validation_curve.psnr_db) = (vec![130, 2600], vec![20.0, 30.0]);
+        cell.cost.validation_seconds = vec![60.0, 120.0];
+        cell.provenance.configuration["train"]["validation"] = 12.into();
+    }
+    assert!(!plot(&cells).unwrap().1.contains("train.validation"));
+    cells.iter_mut().filter(|c| c.axes.method == "cdf").for_each(|c| c.provenance.configuration["train"]["validation"] = 3.into());
+    let (_, svg) = plot(&cells).unwrap();
+    assert!(svg.contains("train.validation") && svg.contains("cdf 3; hexplane 12."), "{svg}");
     cells[0].validation_curve.psnr_db[1] = 1e300;
     write(folder.path(), &cells);
     assert!(report(folder.path(), &options).unwrap_err().to_string().contains("validation_curve"));
@@ -241,6 +253,12 @@ fn images_are_shown_where_they_may_be_and_flicker_is_measured() {
     // The square lies where the renders err: right and below.
     let style = shown.split("class=\"square\" style=\"left:").nth(1).unwrap();
     assert!(style.split('%').next().unwrap().parse::<f64>().unwrap() > 40.0, "{}", &style[..60]);
+    // A sweep may be called `results` like the folder in it; a file in that folder is a result of the sweep, too.
+    let outer = tempfile::tempdir().unwrap();
+    let named = outer.path().join("results");
+    write(&named, &sweep(&named));
+    let of = |path: &Path| count(&report(path, &ReportOptions { images: ImageChoice::BuiltIn, views: 1, ..Default::default() }).unwrap().html);
+    assert_eq!([named.clone(), named.join("results"), named.join("results/0.json")].map(|path| of(&path)), [10, 10, 6]);
     // A third-party scene is shown only on request.
     cells.iter_mut().for_each(|c| c.provenance.data.files = 3);
     write(folder.path(), &cells);
@@ -275,6 +293,43 @@ fn strings_of_results_cannot_leave_their_place() {
     assert!(!made.markdown.contains("<script>") && made.markdown.contains("\\|"));
     assert!(!made.latex.contains("$x_1$") && made.latex.contains("\\$x\\_1\\$"));
     assert!(made.csv.contains("\"<script>") || made.csv.contains("\"\"'"), "quotes are doubled");
+}
+
+#[test]
+fn names_of_missing_cells_cannot_leave_their_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let (training, ids) = ("00000000000000a0", ["00000000000000c0", "00000000000000c1"]);
+    let result = cell(ids[0], |r| r.training = training.into());
+    write(folder.path(), &[]);
+    result.write(&folder.path().join("results").join(format!("{}.json", ids[0]))).unwrap();
+    let planned = |id: &str| PlannedCell { id: id.into(), training: training.into(), codec: format!("c{id}"), choice: result.provenance.codec.clone() };
+    let plan = Plan {
+        kind: "cc4dgs-sweep".into(),
+        schema: 1,
+        name: "g".into(),
+        version: String::new(),
+        commit: String::new(),
+        split: ScoredViews::Test,
+        max_views: 0,
+        images: 0,
+        trainings: vec![PlannedTraining {
+            id: training.into(),
+            scene: "a\n\\input{x}<q>".into(),
+            method: "m".into(),
+            setting: "base".into(),
+            seed: 0,
+            preset: "demo".into(),
+            sets: Vec::new(),
+            minutes: None,
+            data: DataFingerprint { path: "procedural:tiny".into(), hash: "0".into(), files: 0, bytes: 0 },
+            listing: String::new(),
+        }],
+        cells: ids.map(planned).to_vec(),
+    };
+    plan.write(folder.path()).unwrap();
+    let made = report(folder.path(), &ReportOptions { images: ImageChoice::None, ..Default::default() }).unwrap();
+    assert!(made.gap.unwrap().contains("\\input{x}") && made.latex.contains("\n% 1 of 2 cells"), "{}", made.latex);
+    assert!(!made.latex.contains("\\input{x}") && !made.html.contains("<q>") && !made.markdown.contains("<q>"), "{}", made.latex);
 }
 
 #[test]

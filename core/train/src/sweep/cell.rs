@@ -86,7 +86,7 @@ impl<'a> Trained<'a> {
         let kept = spread_views(&self.scene, &views, plan.images);
         let (mut images, mut frame_ms_each) = (Vec::with_capacity(views.len()), Vec::with_capacity(views.len()));
         let began = Instant::now();
-        let (mut image_size, mut sizes_differ) = ([0, 0], false);
+        let (mut image_size, mut sizes_differ, mut pixels) = ([0, 0], false, 0u64);
         let report = evaluate(&decoded, &self.scene, scored, worker.registry, &self.device, worker.events, &mut |view, truth, render, score| {
             if worker.stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted(format!("scoring of cell {}; the next run scores it again", cell.id)));
@@ -102,6 +102,7 @@ impl<'a> Trained<'a> {
                 image_size = size;
             }
             sizes_differ |= size != image_size;
+            pixels += size.into_iter().map(u64::from).product::<u64>();
             frame_ms_each.push(((score.field_ms + score.raster_ms) * 1e3).round() / 1e3);
             images.push(ImageResult {
                 camera: score.camera.clone(),
@@ -150,6 +151,7 @@ impl<'a> Trained<'a> {
             split,
             image_size,
             sizes_differ,
+            scored_pixels: sizes_differ.then_some(pixels),
             frames: self.scene.frame_count,
             iterations: finished.iterations,
             gaussians: report.gaussians,

@@ -4,9 +4,10 @@ use super::folder::SweepFolder;
 use super::lines::write_lines;
 use super::plan::Plan;
 use super::read::RESULTS;
-use super::result::{Axes, CellResult};
-use super::table::{csv, markdown};
+use super::result::{Axes, CellResult, KIND};
+use super::table::{CSV_START, NOTE, csv, markdown};
 use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
@@ -45,7 +46,7 @@ pub struct Collection {
 /// What [`write_tables`] wrote.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Tables {
-    /// All results, one per line, as `docs/results.md` describes.
+    /// All results of the sweep, one per line, as `docs/results.md` describes.
     pub results: PathBuf,
     /// Markdown.
     pub markdown: PathBuf,
@@ -123,16 +124,21 @@ impl Collection {
     }
 }
 
-/// Writes `results` (one file, a line each) and their tables into the sweep's folder; `gap` is what the Markdown says is missing ([`Collection::gap`]).
+/// Writes all `results` (one file, a line each) and the tables of those that are `shown` into the sweep's folder; `gap` is what the Markdown says is missing
+/// ([`Collection::gap`]). Earlier files of these kinds are replaced, others are not.
 ///
 /// # Errors
-/// As [`markdown`], and [`Error::Io`].
-pub fn write_tables(folder: &SweepFolder, results: &[CellResult], gap: Option<&str>) -> Result<Tables> {
+/// As [`markdown`], and [`Error::Io`]; [`Error::Parameter`] where a file of another kind has one of the names.
+pub fn write_tables(folder: &SweepFolder, results: &[CellResult], shown: &[CellResult], gap: Option<&str>) -> Result<Tables> {
     let at = |name: &str| folder.root().join(name);
     let tables = Tables { results: at("results.jsonl"), markdown: at("table.md"), csv: at("table.csv") };
+    let kind = format!("{{\"kind\":\"{KIND}\"");
+    refuse_other_content(&tables.results, "a file of results", |head| head.starts_with(kind.as_bytes()))?;
+    refuse_other_content(&tables.markdown, "the table of a sweep", |head| String::from_utf8_lossy(head).contains(NOTE))?;
+    refuse_other_content(&tables.csv, "the table of a sweep", |head| head.starts_with(CSV_START.as_bytes()))?;
     // Results are written even where they do not belong into one table.
     write_atomically(&tables.results, write_lines(results)?.as_bytes())?;
-    let (mut table, comma_separated) = (markdown(results)?, csv(results)?);
+    let (mut table, comma_separated) = (markdown(shown)?, csv(shown)?);
     if let Some(gap) = gap {
         table = table.replacen("\n\n", &format!("\n\n{gap}\n\n"), 1);
     }
@@ -212,7 +218,7 @@ mod tests {
         assert!([all[1].id.as_str(), "tiny own base seed 0 half", "damaged", "not begun"].iter().all(|part| message.contains(part)), "{message}");
         let gap = partial.gap().unwrap();
         assert_eq!(gap, "1 of 2 cells of the sweep are missing: tiny own base seed 0 half.");
-        let tables = write_tables(&folder, &partial.results, Some(&gap)).unwrap();
+        let tables = write_tables(&folder, &partial.results, &partial.results, Some(&gap)).unwrap();
         assert!(std::fs::read_to_string(tables.markdown).unwrap().contains(&format!("\n\n{gap}\n\n")));
         all[1].write(&folder.result(&all[1].id)).unwrap();
         let complete = collect(&folder, &plan).unwrap();
@@ -223,9 +229,32 @@ mod tests {
         assert_eq!(complete.results.iter().map(renamed).collect::<Vec<_>>(), all.iter().map(renamed).collect::<Vec<_>>());
         assert!(complete.results.iter().all(|r| (r.axes.method.as_str(), r.axes.setting.as_str()) == ("own", "base") && r.sweep == plan.name));
         assert_eq!(collect(&folder, &plan).unwrap(), complete);
-        let tables = write_tables(&folder, &complete.results, None).unwrap();
-        assert_eq!(super::super::read_results(&tables.results).unwrap().len(), 2);
-        assert!(std::fs::read_to_string(tables.markdown).unwrap().contains("| half |"));
+        // Tables may be of some results; the file of results has all.
+        for (shown, has_first) in [(&complete.results[1..], false), (&complete.results[..], true)] {
+            let tables = write_tables(&folder, &complete.results, shown, None).unwrap();
+            assert_eq!(super::super::read_results(&tables.results).unwrap().len(), 2);
+            let table = std::fs::read_to_string(tables.markdown).unwrap();
+            assert!(table.contains("| half |") && table.contains("| raw |") == has_first, "{table}");
+        }
+    }
+
+    #[test]
+    fn tables_replace_tables_only() {
+        let root = tempfile::tempdir().unwrap();
+        let (folder, results) = (SweepFolder::new(root.path()), [cell("a", |_| ())]);
+        // What an incomplete sweep says comes before the note that tells a table.
+        let gap = "a missing cell; ".repeat(200);
+        let make = || write_tables(&folder, &results, &results, Some(&gap));
+        let Tables { results: lines, markdown, csv } = make().unwrap();
+        for file in [lines, markdown, csv] {
+            let made = std::fs::read(&file).unwrap();
+            std::fs::write(&file, "# Mine\n").unwrap();
+            let message = make().unwrap_err().to_string();
+            assert!(message.contains(&file.display().to_string()) && message.contains("exists already"), "{message}");
+            assert_eq!(std::fs::read_to_string(&file).unwrap(), "# Mine\n");
+            std::fs::write(&file, made).unwrap();
+        }
+        make().unwrap();
     }
 
     #[test]

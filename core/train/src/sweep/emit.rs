@@ -32,11 +32,13 @@ pub struct EmitOptions {
     pub program: String,
     /// Processors and threads of a job.
     pub threads: usize,
+    /// Limits of the machines that jobs run on, each `KEY=VALUE`; see [`super::Worker::limits`].
+    pub limits: Vec<String>,
     /// Memory of a job in GB (10^9 bytes).
     pub memory_gb: u32,
     /// Time limit of a job in minutes. A job that reaches it leaves a checkpoint and is run again: SkyPilot does so three times, the others as often as needed.
     pub minutes: u32,
-    /// Jobs at a time; 0 is as many as the scheduler starts.
+    /// Jobs at a time; 0 is as many as the scheduler starts. SkyPilot has no such number.
     pub parallel: usize,
     /// Container image (Kubernetes).
     pub image: String,
@@ -49,15 +51,15 @@ pub struct EmitOptions {
 /// The file for `scheduler`.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a plan without trainings, and for texts that no quoting makes safe.
+/// [`Error::Parameter`] for a plan without trainings, for texts that no quoting makes safe, and for a number of jobs that SkyPilot would not keep to.
 pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<String> {
     if plan.trainings.is_empty() {
         return Err(Error::parameter(format!("sweep {}", plan.name), "it has no training", "Make the plan again from a grid with at least one cell"));
     }
     let o = options;
-    for (option, text) in
-        [("folder", &o.folder), ("--cd", &o.working_folder), ("--program", &o.program), ("--image", &o.image), ("--claim", &o.claim), ("--bucket", &o.bucket)]
-    {
+    let texts =
+        [("folder", &o.folder), ("--cd", &o.working_folder), ("--program", &o.program), ("--image", &o.image), ("--claim", &o.claim), ("--bucket", &o.bucket)];
+    for (option, text) in texts.into_iter().chain(o.limits.iter().map(|limit| ("--limit", limit))) {
         if text.chars().any(char::is_control) {
             return Err(Error::parameter(option, "it has a line break or another control character", "Use another name"));
         }
@@ -69,6 +71,10 @@ pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<
         let problem = format!("'{}' has a backslash, and names of Slurm's logs would then not get the index of their task", o.folder);
         return Err(Error::parameter("folder", problem, "Use another folder, or name it by a link without a backslash (--job-dir)"));
     }
+    if scheduler == Scheduler::SkyPilot && o.parallel > 0 {
+        let problem = format!("{}: SkyPilot itself decides how many managed jobs run at a time", o.parallel);
+        return Err(Error::parameter("--parallel", problem, "Leave it out, and launch the indices in parts"));
+    }
     Ok(match scheduler {
         Scheduler::Slurm => slurm(plan, o),
         Scheduler::Kubernetes => kubernetes(plan, o),
@@ -79,6 +85,11 @@ pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<
 /// `text` as one word of a shell.
 fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', "'\\''"))
+}
+
+/// The limits of `o` as options of a shell's command.
+fn limit_options(o: &EmitOptions) -> String {
+    o.limits.iter().map(|limit| format!("--limit {} ", quoted(limit))).collect()
 }
 
 /// `text`, which has no backslash, as one word of an `#SBATCH` line. sbatch reads these lines by rules of its own: a backslash escapes within quotes, too.
@@ -122,7 +133,7 @@ fn slurm(plan: &Plan, o: &EmitOptions) -> String {
 #SBATCH --output={output}
 set -u
 cd {cd} || exit 2
-{program} --quiet --threads {threads} sweep run {folder} --plan {plan} --index "$SLURM_ARRAY_TASK_ID" &
+{program} --quiet --threads {threads} {limits}sweep run {folder} --plan {plan} --index "$SLURM_ARRAY_TASK_ID" &
 work=$!
 trap 'kill -TERM "$work" 2>/dev/null' TERM INT
 # A signal ends the first wait; the second one waits for the checkpoint.
@@ -145,6 +156,7 @@ exit "$code"
         minutes = o.minutes,
         cd = quoted(&o.working_folder),
         program = quoted(&o.program),
+        limits = limit_options(o),
         folder = quoted(&o.folder),
         plan = plan.id(),
     )
@@ -190,7 +202,7 @@ spec:
         image: {image}
         workingDir: {cd}
         command: [{program}]
-        args: ["--quiet", "--threads", "{threads}", "sweep", "run", {folder}, "--plan", "{plan}", "--index", "$(JOB_COMPLETION_INDEX)"]
+        args: ["--quiet", "--threads", "{threads}", {limits}"sweep", "run", {folder}, "--plan", "{plan}", "--index", "$(JOB_COMPLETION_INDEX)"]
         env:
         - name: JOB_COMPLETION_INDEX
           valueFrom:
@@ -217,6 +229,7 @@ spec:
         image = yaml(&o.image),
         cd = yaml(&o.working_folder),
         program = yaml(&o.program),
+        limits = o.limits.iter().map(|limit| format!("\"--limit\", {}, ", yaml(limit))).collect::<String>(),
         folder = yaml(&o.folder),
         threads = o.threads,
         memory = u64::from(o.memory_gb) * 1000,
@@ -231,8 +244,8 @@ fn skypilot(plan: &Plan, o: &EmitOptions) -> String {
     let last = plan.trainings.len() - 1;
     // SkyPilot has no time limit. `timeout` asks the program to stop and ends with the program's own code.
     let limit = format!("timeout --preserve-status --kill-after={NOTICE_SECONDS} {}", stop_after(o.minutes));
-    let command =
-        format!("{limit} {} --quiet --threads {} sweep run {} --plan {} --index \"$INDEX\"", quoted(&o.program), o.threads, quoted(&o.folder), plan.id());
+    let (program, folder, limits) = (quoted(&o.program), quoted(&o.folder), limit_options(o));
+    let command = format!("{limit} {program} --quiet --threads {} {limits}sweep run {folder} --plan {} --index \"$INDEX\"", o.threads, plan.id());
     format!(
         r#"# {trainings} trainings, {cells} cells. Launch one managed job per index:
 #   for index in $(seq 0 {last}); do sky jobs launch --yes --detach-run --name "{name}-$index" --env INDEX="$index" FILE; done

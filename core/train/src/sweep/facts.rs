@@ -91,12 +91,25 @@ fn root_of(path: &Path) -> PathBuf {
     }
 }
 
+/// Whether `list` takes the file or folder at `inner` of a dataset for a part of it: hidden ones are left out.
+fn is_listed(inner: &Path) -> bool {
+    inner.components().all(|part| matches!(part, Component::Normal(name) if !name.to_string_lossy().starts_with('.')))
+}
+
+/// Whether what is written into `folder`, which need not exist yet, would be a part of the dataset at `path`.
+pub(super) fn would_be_part(folder: &Path, path: &Path) -> bool {
+    let Ok(root) = root_of(path).canonicalize() else { return false };
+    let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_path_buf());
+    // Links are followed as far as there are folders.
+    let real = whole.ancestors().find_map(|known| Some(known.canonicalize().ok()?.join(whole.strip_prefix(known).ok()?)));
+    real.is_some_and(|real| real.strip_prefix(&root).is_ok_and(is_listed))
+}
+
 /// All files of the dataset at `path`: those in its folder, then those elsewhere that its index names, each in the order of their names.
 fn files_of(path: &Path) -> Result<Vec<DataFile>> {
     let root = root_of(path);
     let mut files = list(&root)?;
     let whole = root.canonicalize().map_err(|e| Error::io(&root, e))?;
-    let is_listed = |inner: &Path| inner.components().all(|part| matches!(part, Component::Normal(name) if !name.to_string_lossy().starts_with('.')));
     let mut elsewhere = BTreeMap::new();
     for path in named_files(path) {
         let inner = path.strip_prefix(&root).unwrap_or(&path);
@@ -275,6 +288,13 @@ mod tests {
         let second = of();
         assert!(first[0] != second[0] && first[1] != second[1], "{first:?} {second:?}");
         assert_eq!(list(&root_of(&at("transforms.json"))).unwrap().len(), 3);
+        // So would a sweep's folder in it.
+        for scene in ["transforms.json", "sparse/0"] {
+            for (out, expected) in [("", true), ("new/sweep", true), ("images/../new", true), (".runs/a", false), ("../other", false)] {
+                assert_eq!(would_be_part(&at(out), &at(scene)), expected, "{out} in {scene}");
+            }
+        }
+        assert!(!would_be_part(folder.path(), Path::new("procedural:tiny")));
         // A model beside its images, and one directly in `sparse`: what lies around the project belongs to something else.
         for (project, model) in [("flat/project", "flat/project"), ("direct/project", "direct/project/sparse")] {
             std::fs::create_dir_all(at(model)).unwrap();

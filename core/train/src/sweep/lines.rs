@@ -6,7 +6,7 @@ use cc4dgs_core::{Error, Result};
 use serde_json::{Map, Value, json};
 
 /// Value of `kind` of a line that is a patch.
-const PATCH: &str = "cc4dgs-result-patch";
+pub(super) const PATCH: &str = "cc4dgs-result-patch";
 
 /// The lines of `results`.
 ///

@@ -5,8 +5,9 @@ use super::result::CellResult;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Keys that differ by nature: the seed, how far a training came in its time and what follows from it, what the training measured, and the words of the plan.
-const EXPECTED: [&str; 6] = ["auto", "seed", "train.checkpoint_every", "train.iterations", "train.stretch", "train.zeta"];
+/// Keys that differ by nature: the seed, how far a training came in its time and what follows from it, what the training measured, the words of the plan, and
+/// the memory for images, which follows that of the machine and changes no result.
+const EXPECTED: [&str; 7] = ["auto", "scene.cache_mb", "seed", "train.checkpoint_every", "train.iterations", "train.stretch", "train.zeta"];
 
 /// Notes on those `rows`, each a name and its results, whose trainings have different settings; rows that share their trainings have the same name.
 pub(crate) fn notes<'a>(rows: impl IntoIterator<Item = (String, &'a [&'a CellResult])>) -> BTreeSet<String> {
@@ -59,7 +60,9 @@ mod tests {
                     serde_json::json!({ "seed": seed, "train": { "batch": batch, "iterations": iterations }, "auto": { "minutes": batch } });
             })
         };
-        let (a, b, c) = (with(0, 1, 5000), with(1, 2, 3000), with(2, 1, 5100));
+        let (a, b, mut c) = (with(0, 1, 5000), with(1, 2, 3000), with(2, 1, 5100));
+        // Planned beside fewer processes, which share the memory.
+        c.provenance.configuration["scene"] = serde_json::json!({ "cache_mb": 6000 });
         assert!(notes([("cdf".into(), &[&a, &c][..])]).is_empty());
         let found = notes([("cdf".into(), &[&a, &b, &c][..]), ("cdf".into(), &[&a, &b, &c][..])]);
         assert_eq!(found.len(), 1);

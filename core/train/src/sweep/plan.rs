@@ -1,6 +1,6 @@
 //! From a grid to trainings and cells, each named by what it is made of.
 
-use super::facts::{fingerprint, listing, locate};
+use super::facts::{fingerprint, listing, locate, would_be_part};
 use super::grid::{Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
 use super::hash::{ContentHash, name_of};
 use super::result::{CodecChoice, DataFingerprint};
@@ -8,10 +8,11 @@ use crate::code;
 use crate::config::RunConfig;
 use crate::layers::Layers;
 use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Registry, Result, config};
 use cc4dgs_play::field_weights::FieldWeights;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Value of [`Plan::kind`].
@@ -170,11 +171,20 @@ impl Plan {
     pub fn cells_of<'a>(&'a self, training: &'a str) -> impl Iterator<Item = &'a PlannedCell> {
         self.cells.iter().filter(move |cell| cell.training == training)
     }
-    /// Writes the plan into the folder of a sweep.
+    /// Writes the plan into the folder of a sweep, in place of an earlier one.
     ///
     /// # Errors
-    /// [`Error::Io`].
+    /// [`Error::Parameter`] for a folder in a dataset of the plan, and for one with a `plan.json` of another kind; [`Error::Io`].
     pub fn write(&self, folder: &Path) -> Result<()> {
+        for dataset in self.trainings.iter().map(|training| training.data.path.as_str()).collect::<BTreeSet<_>>() {
+            if would_be_part(folder, &locate(dataset)?) {
+                let problem = format!("it lies in the dataset {dataset}, which would change with every file of the sweep");
+                return Err(Error::parameter(format!("--out {}", folder.display()), problem, "Name a folder outside of the dataset"));
+            }
+        }
+        refuse_other_content(&folder.join(PLAN), "the plan of a sweep", |head| {
+            String::from_utf8_lossy(head).split_whitespace().collect::<String>().starts_with(&format!("{{\"kind\":\"{KIND}\""))
+        })?;
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let json = serde_json::to_string_pretty(self).map_err(|e| Error::backend("plan", e.to_string(), "Report this: every plan should have a JSON form"))?;
         write_atomically(folder.join(PLAN), (json + "\n").as_bytes())
@@ -202,7 +212,8 @@ impl Plan {
         }
         let head: Head = serde_json::from_str(&text).map_err(|e| damaged(e.to_string()))?;
         if head.kind != KIND {
-            return Err(damaged(format!("its kind is \"{}\", a plan has \"{KIND}\"", head.kind)));
+            let problem = format!("its kind is \"{}\", a plan has \"{KIND}\"", head.kind);
+            return Err(Error::data(object, problem, "Name the folder of a sweep, or make one: cc4dgs sweep plan GRID.toml --out DIR"));
         }
         if head.schema != SCHEMA {
             let problem = format!("it has version {}, this program reads version {SCHEMA}", head.schema);
@@ -285,9 +296,16 @@ fn planned(
 /// The configuration as far as it is known before the scene is looked at: all of it, or what the preset `auto` is told.
 fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &dyn Fn(&RunConfig) -> Result<()>) -> Result<toml::Table> {
     let layers = training.layers(registry)?;
-    let known = layers.config()?;
+    let mut known = layers.config()?;
     if layers.want_plan() {
         if layers.state("deformer.kind") {
+            // Settings may be stated of plug-ins that the plan will name.
+            let usual: RunConfig = config::parse_section("configuration", &toml::Table::new())?;
+            for (key, section, usual) in [("density.kind", &mut known.density, usual.density), ("appearance.kind", &mut known.appearance, usual.appearance)] {
+                if !layers.state(key) {
+                    *section = usual;
+                }
+            }
             check(&known)?;
         }
         return Ok(layers.table().clone());

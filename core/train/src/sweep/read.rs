@@ -1,6 +1,6 @@
 //! Reading results back, and refusing to compare what cannot be compared.
 
-use super::lines::read_lines;
+use super::lines::{PATCH, read_lines};
 use super::result::{CellResult, KIND};
 use cc4dgs_core::{Error, Result};
 use serde_json::{Map, Value};
@@ -15,7 +15,7 @@ const MOST_BYTES: u64 = 256 << 20;
 const FRAMES: &str = "frames";
 
 /// Reads results: a `.json` file with one, a `.jsonl` file with one per line, the folder of a sweep, or a folder of such files. In a folder, JSON files of
-/// another kind are skipped. The results are in the order of their axes.
+/// another kind are skipped, and so are `.jsonl` files that begin with another kind. The results are in the order of their axes.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a path that does not exist; [`Error::Data`] for damaged files, for a cell that is there twice with different content and where
@@ -63,7 +63,7 @@ fn files(path: &Path) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// The results of one file; with `lenient`, JSON of another kind is none.
+/// The results of one file; with `lenient`, JSON of another kind is none, such as the log of a run.
 fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
     let object = file.display().to_string();
     let bytes = std::fs::metadata(file).map_err(|e| Error::io(file, e))?.len();
@@ -71,14 +71,13 @@ fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
         return Err(Error::limit(object, bytes, MOST_BYTES, "Split the file"));
     }
     let text = std::fs::read_to_string(file).map_err(|e| Error::io(file, e))?;
-    if file.extension().is_some_and(|e| e == "jsonl") {
-        return read_lines(&object, &text);
-    }
-    let is_other = |text: &str| serde_json::from_str::<Value>(text).is_ok_and(|value| value.get("kind").and_then(Value::as_str) != Some(KIND));
-    if lenient && is_other(&text) {
+    let of_lines = file.extension().is_some_and(|e| e == "jsonl");
+    let head = if of_lines { text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default() } else { text.as_str() };
+    let is_ours = |value: Value| value.get("kind").and_then(Value::as_str).is_some_and(|kind| [KIND, PATCH].contains(&kind));
+    if lenient && serde_json::from_str(head).is_ok_and(|value| !is_ours(value)) {
         return Ok(Vec::new());
     }
-    Ok(vec![CellResult::from_json(&object, &text)?])
+    if of_lines { read_lines(&object, &text) } else { Ok(vec![CellResult::from_json(&object, &text)?]) }
 }
 
 /// Refuses results that do not belong into one table: computed on different devices, scored on different sides of the split, by different protocols of a metric,
@@ -112,6 +111,12 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
         if images(same_scene) != images(result) {
             let of = |r: &CellResult| format!("{} images of {} frames", r.images.len(), r.frames);
             return Err(mixed("sets of images", same_scene, &of(same_scene), result, &of(result)));
+        }
+        // The first image may be one that both leave as small as it is.
+        let others_differ = same_scene.scored_pixels.zip(result.scored_pixels).is_some_and(|(a, b)| a != b);
+        if others_differ || same_scene.sizes_differ != result.sizes_differ {
+            let of = |r: &CellResult| r.image_sizes() + &r.scored_pixels.map_or_else(String::new, |pixels| format!(" ({pixels} pixels together)"));
+            return Err(mixed("sets of image sizes", same_scene, &of(same_scene), result, &of(result)));
         }
         for (name, score) in &result.metrics {
             let other = *of_metric.entry(name).or_insert(result);
@@ -214,11 +219,16 @@ pub(super) mod tests {
         let (a, b) = (cell("a", |r| r.axes.seed = 1), cell("b", |r| r.axes.seed = 0));
         assert!(read_results(folder.path()).unwrap_err().to_string().contains("no result"));
         std::fs::write(folder.path().join("other.json"), "{\"kind\":\"something else\"}").unwrap();
+        std::fs::write(folder.path().join("events.jsonl"), "{\"seconds\":0.5,\"event\":\"run-started\"}\n{\"sec").unwrap();
+        assert!(read_results(folder.path()).unwrap_err().to_string().contains("no result"));
         std::fs::write(folder.path().join("all.jsonl"), format!("{}\n\n{}\n", a.to_line().unwrap(), b.to_line().unwrap())).unwrap();
         a.write(&folder.path().join("a.json")).unwrap();
         let read = read_results(folder.path()).unwrap();
         assert_eq!(read.iter().map(|r| r.id.as_str()).collect::<Vec<_>>(), ["b", "a"], "by axes, equal copies once");
-        assert!(read_results(&folder.path().join("other.json")).is_err(), "a file that is named must be a result");
+        for (name, kind) in [("other.json", "\"something else\""), ("events.jsonl", "\"\"")] {
+            let message = read_results(&folder.path().join(name)).unwrap_err().to_string();
+            assert!(message.contains(kind) && message.contains("Name") && !message.contains("Remove"), "a file that is named must be a result: {message}");
+        }
         cell("a", |r| r.gaussians += 1).write(&folder.path().join("c.json")).unwrap();
         assert!(read_results(folder.path()).unwrap_err().to_string().contains("twice"));
         // The folder of a sweep has the results in a folder of their own.
@@ -244,6 +254,11 @@ pub(super) mod tests {
         assert!(refused(&|r| r.split = cc4dgs_core::Split::Validation).contains("split"));
         assert!(refused(&|r| r.provenance.data.hash = "0".into()).contains("data"));
         assert!(refused(&|r| r.image_size = [200, 200]).contains("200x200"));
+        assert!(refused(&|r| (r.sizes_differ, r.scored_pixels) = (true, Some(240_000))).contains("various sizes (240000 pixels together)"));
+        let various = |pixels: Option<u64>| cell("various", |r| (r.sizes_differ, r.scored_pixels) = (true, pixels));
+        let error = check_comparable(&[various(Some(240_000)), various(Some(250_000))]).unwrap_err().to_string();
+        assert!(error.contains("sets of image sizes") && error.contains("240000") && error.contains("250000"), "{error}");
+        check_comparable(&[various(Some(240_000)), various(Some(240_000)), various(None)]).unwrap();
         // Other images belong to another scene, and only there.
         let other_images = |r: &mut CellResult| _ = r.metrics.get_mut("ssim").unwrap().protocol.insert("frames".into(), Value::Null);
         assert!(refused(&other_images).contains("protocols of ssim"));

@@ -43,6 +43,9 @@ pub struct CellResult {
     /// Whether other scored images have another size; absent where they have not.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sizes_differ: bool,
+    /// Pixels of all scored images together, where their sizes differ; absent in older results, too.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scored_pixels: Option<u64>,
     /// Frames of the sequence.
     pub frames: usize,
     /// Training iterations of all stages.
@@ -362,7 +365,11 @@ impl CellResult {
                 let problem = format!("it has version {other} of the result schema, this program reads versions 1 to {SCHEMA}");
                 return Err(Error::unsupported(object, problem, "Use the program that wrote it, or run the cell again"));
             }
-            (other, _) => return Err(damaged(format!("its kind is \"{other}\", a result has \"{KIND}\""))),
+            (KIND, None) => return Err(damaged("it states no version of the result schema".into())),
+            (other, _) => {
+                let problem = format!("its kind is \"{other}\", a result has \"{KIND}\"");
+                return Err(Error::data(object, problem, "Name a result of a sweep, or the folder of one: docs/results.md describes them"));
+            }
         }
         let result: Self = serde_json::from_value(value).map_err(|e| damaged(e.to_string()))?;
         // Older forms are brought to this one by reading them.

@@ -18,6 +18,10 @@ const SHOWN: [(&str, &str, usize); 6] = [
     ("flip", "FLIP", 4),
 ];
 
+/// Near the beginning of the Markdown table, and at that of the CSV table.
+pub(super) const NOTE: &str = "Mean and sample standard deviation over seeds.";
+pub(super) const CSV_START: &str = "scene,method,setting,codec,seeds,";
+
 /// A number of a result, where it has it.
 type Number = fn(&CellResult) -> Option<f64>;
 
@@ -99,7 +103,7 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     // Writing to a string cannot fail.
     let _ = writeln!(
         text,
-        "Mean and sample standard deviation over seeds. Device {}{adapter}, {}, {} threads, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
+        "{NOTE} Device {}{adapter}, {}, {} threads, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
          Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.{}{sentence}",
         device.name,
         if device.processor.is_empty() { "unknown processor" } else { &device.processor },
@@ -172,7 +176,7 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
     ];
     columns.extend(fixed.into_iter().map(|(name, value)| (name.to_string(), Box::new(value) as Box<Value>)));
     let names = columns.iter().map(|(name, _)| format!("{name},{name}_sd"));
-    let mut text = format!("scene,method,setting,codec,seeds,{},training_devices\n", names.collect::<Vec<_>>().join(","));
+    let mut text = format!("{CSV_START}{},training_devices\n", names.collect::<Vec<_>>().join(","));
     for row in rows {
         let number = |value: Option<f64>| value.map_or_else(String::new, |v| format!("{v}"));
         let values = columns.iter().map(|(_, value)| {

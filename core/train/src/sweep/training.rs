@@ -84,9 +84,15 @@ impl EventSink for Both<'_> {
 /// Where the dataset of `training` lies.
 ///
 /// # Errors
-/// [`Error::Data`] where it changed since the plan was made.
+/// [`Error::Data`] where it is not there, or changed since the plan was made.
 pub(super) fn planned_dataset(training: &PlannedTraining) -> Result<PathBuf> {
     let path = locate(&training.data.path)?;
+    if training.data.files > 0 && !path.exists() {
+        let place = std::path::absolute(&path).unwrap_or_else(|_| path.clone());
+        let problem = format!("there is no {}", place.display());
+        let remedy = "Relative paths start from the folder that the command runs in: run it where the plan was made, or restore the dataset";
+        return Err(Error::data(format!("scene {}", training.data.path), problem, remedy));
+    }
     if listing(&path)? != training.listing {
         let problem = "names or sizes of its files are not those of the plan";
         return Err(Error::data(format!("scene {}", training.data.path), problem, "Restore the dataset, or make the plan again"));
@@ -206,6 +212,18 @@ fn decimals(value: f64, digits: i32) -> f64 {
 mod tests {
     use super::*;
     use crate::event_log::HistoryPoint;
+
+    #[test]
+    fn a_dataset_that_is_not_there_is_no_changed_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut training = super::super::plan::tests::example().trainings.remove(0);
+        training.data.files = 1;
+        training.data.path = folder.path().join("moved").display().to_string();
+        let message = planned_dataset(&training).unwrap_err().to_string();
+        assert!(message.contains("there is no") && message.contains("run it where the plan was made"), "{message}");
+        std::fs::create_dir(folder.path().join("moved")).unwrap();
+        assert!(planned_dataset(&training).unwrap_err().to_string().contains("not those of the plan"));
+    }
 
     #[test]
     fn a_training_states_every_device_that_worked_on_it() {

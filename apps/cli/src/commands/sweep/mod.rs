@@ -51,16 +51,22 @@ pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
     context.output.result(&report, || {
         let time = report.minutes.map_or_else(String::new, |minutes| format!(", about {:.1} hours of training", minutes / 60.0));
         let next = match &report.folder {
-            Some(folder) => format!("run it: {} sweep run {folder}", program()),
+            Some(folder) => format!("run it: {} sweep run {}", program(), word(folder)),
             None => "nothing was written; --out DIR writes the plan".into(),
         };
         format!("{}: {} trainings, {} cells ({} of them finished){time}\n{next}", report.name, report.trainings, report.cells, report.finished)
     })
 }
 
-/// The running program as it was called: one that links other plug-ins has another name than `cc4dgs`.
+/// The running program as it was called, as a word of a shell: one that links other plug-ins has another name than `cc4dgs`.
 fn program() -> String {
-    std::env::args_os().next().map_or_else(|| "cc4dgs".into(), |name| name.to_string_lossy().into_owned())
+    std::env::args_os().next().map_or_else(|| "cc4dgs".into(), |name| word(&name.to_string_lossy()))
+}
+
+/// `text` as one word of a shell, in quotes where it needs some.
+fn word(text: &str) -> String {
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c) || (cfg!(windows) && c == '\\');
+    if !text.is_empty() && text.chars().all(is_plain) { text.into() } else { format!("'{}'", text.replace('\'', "'\\''")) }
 }
 
 /// The grid with the options in place of its values, which are held to the same rules.
@@ -143,16 +149,16 @@ struct CollectReport<'a> {
 pub fn collect(context: &Context, args: &SweepCollect) -> Result<()> {
     let plan = Plan::read(&args.dir)?;
     let folder = SweepFolder::new(&args.dir);
-    let mut collection = collect_results(&folder, &plan)?;
+    let collection = collect_results(&folder, &plan)?;
     if !args.partial {
         collection.check_complete(&folder)?;
     }
     if collection.results.is_empty() {
         return Err(Error::data(format!("sweep {}", args.dir.display()), "there is no result", format!("Run it first: {} sweep run DIR", program())));
     }
-    let results = select(std::mem::take(&mut collection.results), &args.conditions)?;
-    let tables = write_tables(&folder, &results, collection.gap().as_deref())?;
-    let report = CollectReport { collection: &collection, in_table: results.len(), tables: &tables };
+    let shown = select(collection.results.clone(), &args.conditions)?;
+    let tables = write_tables(&folder, &collection.results, &shown, collection.gap().as_deref())?;
+    let report = CollectReport { collection: &collection, in_table: shown.len(), tables: &tables };
     context.output.result(&report, || {
         let mut text = std::fs::read_to_string(&tables.markdown).unwrap_or_default();
         text += &format!("\n{} of {} cells", collection.finished, collection.planned);
@@ -182,6 +188,7 @@ pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
         working_folder: args.cd.clone().map_or_else(|| absolute(Path::new(".")), Ok)?,
         program,
         threads: if threads == 0 { 1 } else { threads },
+        limits: context.limit_options.to_vec(),
         memory_gb: args.memory_gb,
         minutes: args.time_limit,
         parallel: args.parallel,
@@ -201,6 +208,11 @@ pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn paths_with_spaces_are_one_word_of_the_next_command() {
+        assert_eq!(["runs/tiny-1", "my runs", "it's", ""].map(word), ["runs/tiny-1", "'my runs'", "'it'\\''s'", "''"]);
+    }
 
     #[test]
     fn options_take_the_place_of_the_grids_values() {

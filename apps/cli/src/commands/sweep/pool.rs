@@ -28,6 +28,8 @@ struct Job {
     index: usize,
     child: Child,
     began: Instant,
+    /// Bytes that its log had before: what earlier processes said.
+    log_start: u64,
 }
 
 #[derive(Serialize)]
@@ -80,7 +82,8 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     }
     let report = PoolReport { finished: pool.finished(), planned: plan.cells.len(), seconds: began.elapsed().as_secs_f64() };
     context.output.result(&report, || {
-        format!("{} of {} cells are finished; tables: {} sweep collect {}", report.finished, report.planned, super::program(), folder.root().display())
+        let root = super::word(&folder.root().to_string_lossy());
+        format!("{} of {} cells are finished; tables: {} sweep collect {root}", report.finished, report.planned, super::program())
     })
 }
 
@@ -122,6 +125,7 @@ impl Pool<'_> {
         let log_path = self.folder.log(&self.plan.trainings[index].id);
         let io = |e| Error::io(&log_path, e);
         let log = OpenOptions::new().create(true).append(true).open(&log_path).map_err(io)?;
+        let log_start = log.metadata().map_err(io)?.len();
         // On Linux the running program itself, also where a build has replaced its file.
         let program = match Path::new("/proc/self/exe") {
             own if own.exists() => own.to_path_buf(),
@@ -134,7 +138,7 @@ impl Pool<'_> {
         #[cfg(unix)]
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         let child = command.spawn().map_err(|e| Error::io(&program, e))?;
-        self.running.push(Job { index, child, began: Instant::now() });
+        self.running.push(Job { index, child, began: Instant::now(), log_start });
         Ok(())
     }
     /// Takes note of the processes that have ended.
@@ -167,7 +171,7 @@ impl Pool<'_> {
                 self.not_before = Instant::now() + BUSY_PAUSE;
             }
             _ => {
-                let failure = self.failure(job.index, status);
+                let failure = self.failure(job, status);
                 self.folder.set_failure(&training.id, Some(&failure))?;
                 self.note(job.index, format!("failed with exit code {}: {}", failure.exit_code, failure.message));
                 self.failed.push((job.index, failure));
@@ -177,10 +181,10 @@ impl Pool<'_> {
         Ok(())
     }
     /// What a process said before it failed; a process that was ended from outside said nothing.
-    fn failure(&self, index: usize, status: ExitStatus) -> Failure {
-        let id = &self.plan.trainings[index].id;
-        let log = std::fs::read_to_string(self.folder.log(id)).unwrap_or_default();
-        let last = log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").to_string();
+    fn failure(&self, job: &Job, status: ExitStatus) -> Failure {
+        let id = &self.plan.trainings[job.index].id;
+        let log = std::fs::read(self.folder.log(id)).unwrap_or_default();
+        let last = last_words(log.get(job.log_start as usize..).unwrap_or_default());
         match (status.code(), signal(status)) {
             (Some(code), _) => match self.folder.failure(id) {
                 Some(said) if i32::from(said.exit_code) == code => said,
@@ -225,6 +229,17 @@ impl Pool<'_> {
         let object = format!("sweep {}", self.folder.root().display());
         let problem = format!("{} of {} trainings failed: {}{rest}", self.failed.len(), self.plan.trainings.len(), named.join("; "));
         of_exit_code(self.failed.first().map_or(1, |(_, failure)| failure.exit_code), object, problem)
+    }
+}
+
+/// What a process said at its end: the place and the message of a panic, else its last line.
+fn last_words(log: &[u8]) -> String {
+    let text = String::from_utf8_lossy(log);
+    let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+    let panic = lines.iter().rposition(|line| line.starts_with("thread '") && line.contains("panicked at "));
+    match panic {
+        Some(at) => lines[at..].iter().take(2).copied().collect::<Vec<_>>().join(" "),
+        None => lines.last().map_or_else(|| "it said nothing".into(), ToString::to_string),
     }
 }
 
@@ -305,6 +320,14 @@ mod tests {
             assert_eq!(said.starts_with("sweep a: ") && said.contains("The folder logs"), code != INTERRUPTED, "{said}");
         }
         assert!(of_exit_code(4, String::new(), String::new()).to_string().contains("--jobs"));
+    }
+
+    #[test]
+    fn a_crash_says_what_went_wrong() {
+        let panic = "first\n\nthread 'main' (7) panicked at src/a.rs:1:2:\nindex out of bounds\nnote: run with `RUST_BACKTRACE=1` environment variable\n";
+        assert_eq!(last_words(panic.as_bytes()), "thread 'main' (7) panicked at src/a.rs:1:2: index out of bounds");
+        assert_eq!([&b"a\n b\n\n"[..], b"\xff"].map(last_words), ["b", "\u{fffd}"]);
+        assert_eq!(last_words(b""), "it said nothing");
     }
 
     #[test]

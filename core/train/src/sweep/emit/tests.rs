@@ -15,9 +15,10 @@ fn options() -> EmitOptions {
         working_folder: "/data".into(),
         program: "/opt/cc4dgs".into(),
         threads: 2,
+        limits: Vec::new(),
         memory_gb: 8,
         minutes: 60,
-        parallel: 3,
+        parallel: 0,
         image: "registry.example/cc4dgs:1".into(),
         claim: "sweeps".into(),
         bucket: "s3://sweeps".into(),
@@ -171,7 +172,7 @@ fn indices_reach_the_program() {
     let arguments: Vec<&str> = container["args"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
     let id = plan().id();
     assert_eq!(arguments, ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--plan", &id, "--index", "$(JOB_COMPLETION_INDEX)"]);
-    let slurm = emit(Scheduler::Slurm, &plan(), &options()).unwrap();
+    let slurm = emit(Scheduler::Slurm, &plan(), &EmitOptions { parallel: 3, ..options() }).unwrap();
     assert!(slurm.contains("#SBATCH --array=0-0%3\n") && slurm.contains(&format!("--plan {id} --index \"$SLURM_ARRAY_TASK_ID\"")), "{slurm}");
     let sky = emit(Scheduler::SkyPilot, &plan(), &options()).unwrap();
     assert!(sky.contains(&format!("--plan {id} --index \"$INDEX\"")), "{sky}");
@@ -179,6 +180,19 @@ fn indices_reach_the_program() {
     grown.trainings.push(PlannedTraining { id: "another".into(), ..grown.trainings[0].clone() });
     assert!(plan().check_id(&id).is_ok());
     assert!(grown.check_id(&id).unwrap_err().to_string().contains("sweep emit"));
+}
+
+#[test]
+fn limits_reach_the_program() {
+    let limited = EmitOptions { limits: ["max_bytes=7", "max_pixels=9"].map(String::from).to_vec(), ..options() };
+    let of = |scheduler| emit(scheduler, &plan(), &limited).unwrap();
+    for scheduler in [Scheduler::Slurm, Scheduler::SkyPilot] {
+        let text = of(scheduler);
+        assert!(text.contains(" --threads 2 --limit 'max_bytes=7' --limit 'max_pixels=9' sweep run "), "{text}");
+    }
+    let pod = parse(&of(Scheduler::Kubernetes));
+    let arguments = &pod["spec"]["template"]["spec"]["containers"][0]["args"];
+    assert_eq!(arguments.as_array().unwrap()[3..8], ["--limit", "max_bytes=7", "--limit", "max_pixels=9", "sweep"].map(Value::from));
 }
 
 /// The script as bash reads it, with a program that answers with its arguments and an exit code.
@@ -219,4 +233,8 @@ fn what_cannot_be_written_is_refused() {
     let broken = EmitOptions { image: "a\nb".into(), ..options() };
     assert!(emit(Scheduler::Kubernetes, &plan(), &broken).unwrap_err().to_string().contains("--image"));
     assert!(emit(Scheduler::Slurm, &plan(), &EmitOptions { minutes: 0, ..options() }).is_err());
+    let several = EmitOptions { parallel: 3, ..options() };
+    assert!(emit(Scheduler::Kubernetes, &plan(), &several).unwrap().contains("  parallelism: 3\n"));
+    let message = emit(Scheduler::SkyPilot, &plan(), &several).unwrap_err().to_string();
+    assert!(message.contains("--parallel: 3") && message.contains("Leave it out"), "{message}");
 }

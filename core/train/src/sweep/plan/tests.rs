@@ -108,6 +108,24 @@ fn plans_are_read_strictly() {
     assert!(matches!(write(KIND, "other"), Error::Data { .. }));
 }
 
+#[test]
+fn a_plan_replaces_plans_only_and_lies_in_no_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("sweep");
+    let mut plan = example();
+    plan.write(&out).unwrap();
+    plan.write(&out).unwrap();
+    std::fs::write(out.join(PLAN), "{\"name\": \"mine\"}").unwrap();
+    let message = plan.write(&out).unwrap_err().to_string();
+    assert!(message.contains("plan.json") && message.contains("not the plan of a sweep"), "{message}");
+    assert_eq!(std::fs::read_to_string(out.join(PLAN)).unwrap(), "{\"name\": \"mine\"}");
+    // A training begins when the files of its dataset are those of the plan.
+    plan.trainings[0].data.path = folder.path().display().to_string();
+    let inner = folder.path().join("runs/a");
+    let message = plan.write(&inner).unwrap_err().to_string();
+    assert!(message.contains("lies in the dataset") && message.contains("outside of the dataset") && !inner.exists(), "{message}");
+}
+
 /// A plan of one training with two cells.
 pub(in crate::sweep) fn example() -> Plan {
     let (version, commit) = code::version();
