@@ -12,7 +12,7 @@ use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
     Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput, config,
-    inventory,
+    inventory, ordered_sum,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -213,15 +213,21 @@ impl Deformer for HexPlane {
                 if weight > 0.0 && along > 2 {
                     let n = along - 2;
                     let bend = plane.clone().narrow(0, 0, n) - plane.clone().narrow(0, 1, n).mul_scalar(2.0) + plane.clone().narrow(0, 2, n);
-                    add((bend.clone() * bend).mean().mul_scalar(weight));
+                    add(mean(bend.clone() * bend).mul_scalar(weight));
                 }
                 if is_time && s.time_one > 0.0 {
-                    add((plane - 1.0).abs().mean().mul_scalar(s.time_one));
+                    add(mean((plane - 1.0).abs()).mul_scalar(s.time_one));
                 }
             }
         }
         Ok(total)
     }
+}
+
+/// Mean of all `values`, the same bits whatever the number of threads.
+fn mean(values: Tensor<2>) -> Tensor<1> {
+    let count = values.dims().iter().product::<usize>();
+    ordered_sum(values).mul_scalar(1.0 / count as f64)
 }
 
 fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {

@@ -5,8 +5,10 @@
 
 use cc4dgs::core::burn::tensor::Device;
 use cc4dgs::core::gaussians::to_vec;
-use cc4dgs::core::{DensityControl, DensityPlan, DensityPlugin, Gaussians, Plugin, Schedule, Seed, Statistic, ViewStatistics, config, inventory, serde};
-use cc4dgs::{Result, Session, Split};
+use cc4dgs::core::{
+    DensityControl, DensityPlan, DensityPlugin, Gaussians, Plugin, Schedule, Seed, Statistic, ViewStatistics, config, conformance, inventory, serde, toml,
+};
+use cc4dgs::{Error, Result, Session, Split};
 use std::sync::Arc;
 
 /// Iterations between two rounds. There are no settings.
@@ -28,7 +30,8 @@ impl DensityControl for Budget {
             return Ok(None);
         }
         let opacity: Vec<f32> = to_vec(gaussians.opacity_logits.clone(), "opacities")?.into_iter().map(|o| 1.0 / (1.0 + (-o).exp())).collect();
-        let (dead, mut alive): (Vec<usize>, Vec<usize>) = (0..opacity.len()).partition(|&i| opacity[i] < 0.01);
+        // An opacity that is not a number is over no threshold: nothing is copied from such a Gaussian.
+        let (mut alive, dead): (Vec<usize>, Vec<usize>) = (0..opacity.len()).partition(|&i| opacity[i] >= 0.01);
         if dead.is_empty() || alive.is_empty() {
             return Ok(None);
         }
@@ -65,6 +68,10 @@ inventory::submit! {
 fn main() -> Result<()> {
     let iterations = std::env::args().nth(1).unwrap_or_else(|| "600".into());
     let session = Session::new()?;
+    let findings = conformance::density(session.registry().density("budget")?, &toml::Table::new(), session.device());
+    if !findings.is_empty() {
+        return Err(Error::backend("density control budget", findings.join("\n"), "Correct it"));
+    }
     let config = session.config("demo", &["density.kind=budget", &format!("train.iterations={iterations}")])?;
     let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene)?);
     let model = session.train(&config, scene.clone(), None)?;

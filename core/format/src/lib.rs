@@ -2,7 +2,8 @@
 //!
 //! This crate does not depend on burn, and on `wasm32` not on C libraries. It is all that a codec or a small player needs. To add a codec, implement
 //! [`AttributeCodec`] (or [`WeightCodec`]) and submit a [`CodecPlugin`] ([`WeightCodecPlugin`]) through `inventory::submit!`. [`storage`] has building blocks
-//! that most codecs share, [`conformance`] the suites that every codec must pass. inventory, serde and toml are re-exported in the versions that this crate uses.
+//! that most codecs share, [`conformance`] the suites that every codec must pass. glam, inventory, serde and toml are re-exported in the versions that this crate
+//! uses.
 
 pub mod archive;
 mod camera;
@@ -49,4 +50,4 @@ pub use similarity::Similarity;
 pub use stored_model::{FIELD_STREAMS, MOVING, StoredModel, canonical_stages, read_gaussians, read_stage, read_weights, weight_seed};
 pub use tuning::{EncodedWeights, Rounding, TuneModel, TunedModel, Tuning};
 pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin, WeightSteps};
-pub use {inventory, serde, toml};
+pub use {glam, inventory, serde, toml};

@@ -56,11 +56,16 @@ impl<P: PluginEntry> Entries<P> {
     /// Collects all linked plug-ins of this kind.
     ///
     /// # Errors
-    /// [`Error::Parameter`] if two plug-ins have the same name.
+    /// [`Error::Parameter`] if two plug-ins have the same name, and for a name with other characters than lower-case letters, digits and '-': some have a
+    /// meaning where names are written (`codec:profile`, `family+method`).
     pub fn collect() -> Result<Self> {
         let mut map = BTreeMap::new();
         for plugin in P::linked() {
             let name = plugin.info().name;
+            if name.is_empty() || !name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-') {
+                let problem = "the name of a plug-in has lower-case letters, digits and '-', and nothing else";
+                return Err(Error::parameter(format!("{} '{name}'", P::KIND), problem, "Rename it where it is registered"));
+            }
             if map.insert(name, plugin).is_some() {
                 return Err(Error::parameter(format!("{} {name}", P::KIND), "two plug-ins registered this name", "Rename one of them or link only one"));
             }
@@ -70,9 +75,16 @@ impl<P: PluginEntry> Entries<P> {
     /// The entry called `name`.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for an unknown name; it lists similar names.
+    /// [`Error::Parameter`] for a name that no linked plug-in has; it lists similar names.
     pub fn get(&self, name: &str) -> Result<&'static P> {
-        self.0.get(name).copied().ok_or_else(|| unknown_name(P::KIND, name, self.0.keys().copied()))
+        self.0.get(name).copied().ok_or_else(|| self.not_linked(name))
+    }
+    fn not_linked(&self, name: &str) -> Error {
+        let remedy = match self.0.is_empty() {
+            true => "Nor is any other of this kind: name the crate of the plug-in in the program or test, as in `use my_plugins as _;`".to_string(),
+            false => similar_names(name, self.0.keys().copied()),
+        };
+        Error::parameter(format!("{} '{name}'", P::KIND), "no plug-in of this name is linked into this program", remedy)
     }
     /// All entries, sorted by name.
     pub fn iter(&self) -> impl Iterator<Item = &'static P> + '_ {
@@ -95,13 +107,19 @@ pub fn by_likeness<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> Vec<
 
 /// An error for the unknown `name` of a `kind`; it lists all `known` names and the most similar ones.
 pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a str>) -> Error {
+    Error::parameter(format!("{kind} '{name}'"), "unknown name", similar_names(name, known))
+}
+
+/// All `known` names, those that are most like `name` first, in words.
+fn similar_names<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> String {
     let known = by_likeness(name, known);
+    if known.is_empty() {
+        return "There are none; leave it out".into();
+    }
     // Jaro-Winkler misses swapped letters in short names; edit distance misses long names that share only a prefix.
     let few_edits = |k: &str| strsim::damerau_levenshtein(k, name) <= (name.chars().count() / 3).min(2);
     let near: Vec<&str> = known.iter().copied().filter(|k| strsim::jaro_winkler(k, name) > 0.75 || few_edits(k)).take(3).collect();
-    let remedy =
-        if near.is_empty() { format!("Known: {}", known.join(", ")) } else { format!("Did you mean {}? Known: {}", near.join(" or "), known.join(", ")) };
-    Error::parameter(format!("{kind} '{name}'"), "unknown name", remedy)
+    if near.is_empty() { format!("Known: {}", known.join(", ")) } else { format!("Did you mean {}? Known: {}", near.join(" or "), known.join(", ")) }
 }
 
 /// Refuses the plug-in `name` of a `kind`, which the file `object` needs, if it is not among the `linked` ones, or reads another version than the `stored` one.
@@ -136,7 +154,42 @@ pub fn split_kind(object: &str, section: &toml::Table) -> Result<(String, toml::
 
 #[cfg(test)]
 mod tests {
-    use super::{Plugin, check_linked, unknown_name};
+    use super::{Entries, Plugin, PluginEntry, check_linked, unknown_name};
+
+    /// Names of the plug-ins of four programs.
+    const LINKED: [&[&str]; 4] = [&[], &["one", "two-2"], &["one", "one"], &["one", "Two:high"]];
+
+    /// A kind of plug-in in the program of this index.
+    struct Thing<const PROGRAM: usize>(Plugin);
+
+    impl<const PROGRAM: usize> PluginEntry for Thing<PROGRAM> {
+        const KIND: &'static str = "thing";
+        fn info(&self) -> &Plugin {
+            &self.0
+        }
+        fn linked() -> Vec<&'static Self> {
+            let plugin = |name: &'static str| Box::leak(Box::new(Self(Plugin { name, version: "1", summary: "", paper: "", schema: "", capabilities: &[] })));
+            LINKED[PROGRAM].iter().map(|&name| &*plugin(name)).collect()
+        }
+    }
+
+    #[test]
+    fn names_are_unique_and_can_be_written() {
+        let twice = Entries::<Thing<2>>::collect().err().unwrap().to_string();
+        assert!(twice.starts_with("thing one: two plug-ins registered this name"), "{twice}");
+        let odd = Entries::<Thing<3>>::collect().err().unwrap().to_string();
+        assert!(odd.starts_with("thing 'Two:high': the name of a plug-in has lower-case letters"), "{odd}");
+        assert_eq!(Entries::<Thing<1>>::collect().unwrap().iter().count(), 2);
+    }
+
+    #[test]
+    fn what_is_not_linked_says_so() {
+        let other = Entries::<Thing<1>>::collect().unwrap().get("two").err().unwrap().to_string();
+        assert_eq!(other, "thing 'two': no plug-in of this name is linked into this program. Did you mean two-2? Known: two-2, one");
+        let none = Entries::<Thing<0>>::collect().unwrap().get("two").err().unwrap().to_string();
+        assert!(none.starts_with("thing 'two': no plug-in of this name is linked") && none.contains("use my_plugins as _;"), "{none}");
+        assert_eq!(unknown_name("profile", "high", [].into_iter()).to_string(), "profile 'high': unknown name. There are none; leave it out");
+    }
 
     #[test]
     fn plug_ins_that_are_missing_or_of_another_version_are_told_apart() {

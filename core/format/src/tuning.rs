@@ -73,7 +73,7 @@ pub trait TuneModel {
     /// [`crate::Error::Interrupted`] if the user asks for it, [`crate::Error::Backend`] where values do not stay finite, and what scene and parts report.
     fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel>;
     /// Mean PSNR in dB of `gaussians` as they are, moved by `weights`: rounded in steps that are `weight_steps` times those chosen without training, or as they
-    /// are. Validation views judge where the model was trained with some, else training views.
+    /// are. Validation views judge where the scene has some, else training views.
     ///
     /// # Errors
     /// What scene and parts report.

@@ -1,6 +1,7 @@
 //! The deformer trait (deformation fields), its inputs and parameters.
 
 use crate::gaussians::{CORE_ATTRIBUTES, first_rows};
+use crate::storage::value_count;
 use crate::{DeformerContext, Error, Offsets, Plugin, Result};
 use burn::tensor::{Device, Int, Tensor};
 use serde::{Deserialize, Serialize};
@@ -189,6 +190,27 @@ pub fn check_attributes(deformer: &str, attributes: &[AttributeSpec]) -> Result<
     Ok(())
 }
 
+/// Refuses weights that can be neither trained nor stored: names that are empty, not printable or used twice, values that are not as many as the shape says, and
+/// groups that do not exist. `owner` names the plug-in in errors.
+///
+/// # Errors
+/// [`Error::Parameter`] that names the plug-in and the array.
+pub fn check_parameters(owner: &str, parameters: &[&Parameter], groups: &[ParameterGroup]) -> Result<()> {
+    for (index, parameter) in parameters.iter().enumerate() {
+        let Parameter { name, shape, value, group, .. } = parameter;
+        let count = value.dims()[0];
+        let problem = match () {
+            () if name.is_empty() || name.chars().any(char::is_control) => "the name is empty or not printable".to_string(),
+            () if parameters[..index].iter().any(|other| other.name == *name) => "the name is used twice".into(),
+            () if value_count(shape) != Some(count) => format!("{count} values have the shape {shape:?}"),
+            () if *group >= groups.len() => format!("they are in group {group}, counted from 0, and there are {}", groups.len()),
+            () => continue,
+        };
+        return Err(Error::parameter(format!("{owner}: weights '{name}'"), problem, "Correct what its parameters() and groups() return"));
+    }
+    Ok(())
+}
+
 /// A deformer (deformation field): from canonical Gaussians to offsets at a time (paper Section IV-B).
 ///
 /// The time-invariant half is a separate call, so that playback can cache it. Training recomputes it every step.
@@ -223,7 +245,8 @@ pub trait Deformer: Send {
     fn is_static(&self) -> bool {
         false
     }
-    /// An additional loss term `[1]` for the moving Gaussians at `time_norm` (0..1); `progress` (0..1) is that of the main stage.
+    /// An additional loss term `[1]` for the moving Gaussians, once per iteration, at `time_norm` (0..1), the time of its first view; `progress` (0..1) is that of the
+    /// main stage.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }

@@ -128,7 +128,8 @@ impl DensityPlan {
         self.fresh = order.iter().map(|&row| self.fresh[row]).collect();
         self.values.iter_mut().flat_map(|set| &mut set.rows).for_each(|row| *row = moved_to[*row]);
     }
-    /// Starts the optimizer state of `attribute` anew in all rows (opacity resets).
+    /// Starts the optimizer state of `attribute` anew in all rows. A plan that restarts `opacity_logits` is an opacity reset: the trainer leaves the reset out
+    /// where too little time is left or the last one is not back, and undoes one from which training views do not recover.
     pub fn restart(&mut self, attribute: &str) {
         self.restarted.push(attribute.into());
     }
@@ -197,6 +198,9 @@ impl DensityPlan {
         if let Some(row) = self.parents.iter().find(|&&row| row >= count) {
             return bad(format!("its plan refers to row {row} of {count}"));
         }
+        if let Some(name) = self.restarted.iter().find(|name| gaussians.attribute(name).is_none()) {
+            return bad(format!("its plan restarts the attribute '{name}', which the Gaussians do not have"));
+        }
         for set in &self.values {
             let Some(width) = gaussians.attribute(&set.attribute).map(|a| a.dims()[1]) else {
                 return bad(format!("its plan sets the attribute '{}', which the Gaussians do not have", set.attribute));
@@ -224,7 +228,8 @@ fn index_tensor(rows: &[usize], device: &Device) -> Tensor<1, Int> {
 
 /// Adds, moves and removes Gaussians during the coarse and the main stage. It owns its settings, its statistics, and its state in checkpoints.
 pub trait DensityControl: Send {
-    /// A stage begins with `count` Gaussians: statistics start from zero.
+    /// A stage begins with `count` Gaussians: statistics start from zero. Also called before [`DensityControl::restore`] where the trainer goes back to an earlier
+    /// state of the stage.
     fn begin_stage(&mut self, count: usize, device: &Device);
     /// The optional statistics that it needs from the views of this iteration.
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic>;
@@ -233,8 +238,8 @@ pub trait DensityControl: Send {
     /// Called before every [`DensityControl::plan`]: growth must stay `count` Gaussians below its upper bound. That many were removed, and training views do not have
     /// their earlier PSNR yet. Default: ignored, for controls that replace what they remove in the same plan.
     fn hold(&mut self, _count: usize) {}
-    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`]), executes
-    /// it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
+    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`]) and puts
+    /// those that move first, executes it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
     /// The Gaussians are now those of `plan`: statistics per Gaussian must follow its rows. Default: nothing, for controls that keep none.
     fn executed(&mut self, _plan: &DensityPlan, _device: &Device) -> Result<()> {
@@ -322,5 +327,12 @@ mod tests {
         for (attribute, values) in [("means", &[1.0][..]), ("means", &[1.0, f32::NAN, 0.0]), ("colour", &[1.0])] {
             assert!(with(attribute, values).unwrap_err().to_string().contains(attribute), "{attribute}");
         }
+        let restarting = |attribute: &str| {
+            let mut plan = DensityPlan::unchanged(3);
+            plan.restart(attribute);
+            plan.check("t", &g)
+        };
+        assert!(restarting("opacity_logits").is_ok());
+        assert!(restarting("opacities").unwrap_err().to_string().contains("restarts the attribute 'opacities'"));
     }
 }

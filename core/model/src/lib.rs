@@ -1,6 +1,6 @@
 //! Gaussians, cameras and scenes as tensors, the traits of plug-ins for training and playback, and the registry of cc4dgs.
 //!
-//! A plug-in crate depends on this crate alone (burn, inventory, serde and toml are re-exported in the versions that it uses): implement a trait such as
+//! A plug-in crate depends on this crate alone (burn, glam, inventory, serde and toml are re-exported in the versions that it uses): implement a trait such as
 //! [`Deformer`] or [`Rasterizer`] and submit a [`DeformerPlugin`] or [`RasterizerPlugin`] through `inventory::submit!`. Codecs need only `cc4dgs-format`, whose
 //! items are re-exported here.
 
@@ -39,12 +39,12 @@ pub use cc4dgs_format::{
     Event, EventSink, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, FIELD_STREAMS, Fanout, FileBytes,
     GaussianFile, HostGaussians, Image8, Limits, MOVING, Moving, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rounding,
     Rules, Seed, Silent, Similarity, StoredModel, Stream, StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec,
-    WeightCodecPlugin, WeightSteps, archive, blur_at, by_likeness, canonical_stages, config, exporter, inventory, playback, plugin_kind, ply, psnr_of,
+    WeightCodecPlugin, WeightSteps, archive, blur_at, by_likeness, canonical_stages, config, exporter, glam, inventory, playback, plugin_kind, ply, psnr_of,
     psnr_on_views, read_gaussians, read_stage, read_weights, serde, split_kind, spz, storage, toml, unknown_name, weight_seed,
 };
 pub use deformer::{
     AttributeSpec, BuildLayer, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures,
-    SpatialInput, check_attributes,
+    SpatialInput, check_attributes, check_parameters,
 };
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
 pub use device::{DEVICE_NAMES, parse_device, resolved_device};

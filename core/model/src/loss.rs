@@ -6,7 +6,8 @@ use burn::tensor::Tensor;
 
 /// Input of a loss term: one view at one time.
 pub struct LossInput<'a> {
-    /// Rendered planes `[5,H,W]`: red, green, blue as the camera records them (after the appearance model), alpha, depth. Gradients flow through them.
+    /// Rendered planes `[5,H,W]`: red, green, blue as the camera records them (after the appearance model), alpha, depth. Gradients flow through them. In the score
+    /// stage (`[score_loss]`) the first three are the blended dynamic scores, and gradients reach nothing else.
     pub planes: &'a Tensor<3>,
     /// Recorded planes `[3,H,W]` in 0..1, or the mask `[1,H,W]` of the score stage.
     pub target: &'a Tensor<3>,
@@ -22,7 +23,7 @@ pub struct LossInput<'a> {
 
 /// One term of the loss.
 pub trait LossTerm: Send {
-    /// The value `[1]` for one view, without its weight; `None` if the term does not apply.
+    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape ends the training with an error.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
 }
 

@@ -4,7 +4,7 @@ use crate::playback::MotionPlugin;
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerLayerPlugin, DeformerPlugin,
     DensityControl, DensityPlugin, Entries, Error, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer,
-    RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, config, split_kind,
+    RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, check_attributes, check_parameters, config, split_kind,
 };
 use burn::tensor::Device;
 
@@ -100,9 +100,14 @@ impl Registry {
         (self.density(&kind)?.build)(&settings)
     }
     /// Builds the appearance model of an `[appearance]` section (`kind` and its settings).
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for an unknown `kind` and for weights that can be neither trained nor stored ([`check_parameters`]), and what the plug-in reports.
     pub fn build_appearance(&self, section: &toml::Table, context: &AppearanceContext, device: &Device) -> Result<Box<dyn Appearance>> {
         let (kind, settings) = split_kind("appearance", section)?;
-        (self.appearance(&kind)?.build)(&settings, context, device)
+        let appearance = (self.appearance(&kind)?.build)(&settings, context, device)?;
+        check_parameters(&format!("appearance {kind}"), &appearance.parameters(), &appearance.groups())?;
+        Ok(appearance)
     }
     /// Builds the optimizer of an `[optimizer]` section (`kind` and its settings).
     pub fn build_optimizer(&self, section: &toml::Table) -> Result<Box<dyn Optimizer>> {
@@ -130,11 +135,18 @@ impl Registry {
     }
     /// Builds the deformer of a `[deformer]` section: `kind`, its settings, and the layers around it, in the order of their names. A layer's key holds true,
     /// false or a table of its settings.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for an unknown `kind`, for a layer whose key holds something else, and for attributes and weights that can be neither trained nor stored
+    /// ([`check_attributes`], [`check_parameters`]), and what the plug-ins report.
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
         let (kind, mut settings) = split_kind("deformer", section)?;
         let layers = self.take_layers(&mut settings)?;
         let deformer = (self.deformer(&kind)?.build)(&settings, context, device)?;
-        layers.into_iter().try_fold(deformer, |inner, (layer, table)| (layer.build)(&table, inner))
+        let deformer = layers.into_iter().try_fold(deformer, |inner, (layer, table)| (layer.build)(&table, inner))?;
+        check_attributes(&kind, &deformer.attributes())?;
+        check_parameters(&format!("deformer {kind}"), &deformer.parameters(), &deformer.groups())?;
+        Ok(deformer)
     }
     /// A `[deformer]` section with every setting of the deformer and of the layers around it stated, defaults included.
     ///
@@ -183,5 +195,84 @@ impl Registry {
     /// Builds the weight codec called `name` with `settings`.
     pub fn build_weight_codec(&self, name: &str, settings: &toml::Table) -> Result<Box<dyn WeightCodec>> {
         (self.weight_codec(name)?.build)(settings)
+    }
+}
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+    use crate::{AttributeSpec, Offsets, Parameter, ParameterGroup, Part, Seed, SpatialFeatures, SpatialInput, inventory};
+    use burn::tensor::Tensor;
+
+    /// Weights in a group that does not exist, or an attribute that every Gaussian has: nothing needs either before the main stage.
+    struct Wrong {
+        parameters: Vec<Parameter>,
+        attributes: Vec<AttributeSpec>,
+    }
+
+    impl Deformer for Wrong {
+        fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+            Ok(SpatialFeatures { values: input.means_world.clone(), work: Default::default() })
+        }
+        fn attributes(&self) -> Vec<AttributeSpec> {
+            self.attributes.clone()
+        }
+        fn deform(&self, _: Tensor<2>, _: f32) -> Result<Offsets> {
+            Ok(Offsets::default())
+        }
+        fn parameters(&self) -> Vec<&Parameter> {
+            self.parameters.iter().collect()
+        }
+        fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+            self.parameters.iter_mut().collect()
+        }
+        fn groups(&self) -> Vec<ParameterGroup> {
+            vec![ParameterGroup::plain("only", 1e-3, 1e-3)]
+        }
+    }
+
+    /// The group of the weights, and the name of the attribute.
+    fn build(settings: &toml::Table, _: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
+        let group = settings.get("group").and_then(toml::Value::as_integer).unwrap_or(0) as usize;
+        let parameters = vec![Parameter { name: "w".into(), part: Part::Net, shape: vec![2], value: Tensor::zeros([2], device), group }];
+        let attributes = settings.get("attribute").and_then(toml::Value::as_str).map(|name| AttributeSpec::new(name, 1, 0.0, 1e-3));
+        Ok(Box::new(Wrong { parameters, attributes: attributes.into_iter().collect() }))
+    }
+
+    inventory::submit! {
+        DeformerPlugin { info: Plugin { name: "wrong", version: "1", summary: "a test", paper: "", schema: "", capabilities: &[] }, build }
+    }
+
+    #[test]
+    fn deformers_that_cannot_be_trained_are_refused_when_they_are_built() {
+        let registry = Registry::collect().unwrap();
+        let context = DeformerContext { box_min: [0.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: 0, seed: Seed::root(1) };
+        let of = |settings: &str| {
+            let section = config::parse_table("test", &format!("kind = 'wrong'\n{settings}")).unwrap();
+            registry.build_deformer(&section, &context, &Device::flex()).map(drop).map_err(|e| e.to_string())
+        };
+        assert_eq!(of("attribute = 'mine'"), Ok(()));
+        let group = of("group = 1").unwrap_err();
+        assert!(group.starts_with("deformer wrong: weights 'w': they are in group 1"), "{group}");
+        let attribute = of("attribute = 'means'").unwrap_err();
+        assert!(attribute.starts_with("deformer wrong: attribute 'means'"), "{attribute}");
+    }
+
+    #[test]
+    fn weights_that_cannot_be_stored_are_named() {
+        let groups = [ParameterGroup::plain("only", 1e-3, 1e-3)];
+        let flex = Device::flex();
+        let array = |name: &str, shape: Vec<usize>| Parameter { name: name.into(), part: Part::Grid, shape, value: Tensor::zeros([6], &flex), group: 0 };
+        let check = |arrays: &[Parameter]| check_parameters("mine", &arrays.iter().collect::<Vec<_>>(), &groups).map_err(|e| e.to_string());
+        assert_eq!(check(&[array("a", vec![2, 3]), array("b", vec![6])]), Ok(()));
+        for (arrays, problem) in [
+            ([array("a", vec![2, 3]), array("a", vec![6])], "weights 'a': the name is used twice"),
+            ([array("a", vec![2, 3]), array("", vec![6])], "weights '': the name is empty"),
+            ([array("a", vec![2, 3]), array("b", vec![5])], "weights 'b': 6 values have the shape [5]"),
+            ([array("a", vec![2, 3]), array("b", vec![usize::MAX, 2])], "weights 'b': 6 values have the shape"),
+        ] {
+            let message = check(&arrays).unwrap_err();
+            assert!(message.starts_with("mine: ") && message.contains(problem), "{message}");
+        }
     }
 }

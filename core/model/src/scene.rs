@@ -107,10 +107,10 @@ impl Scene {
         for camera in &cameras {
             camera.validate()?;
         }
-        if let Some(v) = views.iter().find(|v| v.camera >= cameras.len() || !v.time_norm.is_finite()) {
+        if let Some(v) = views.iter().find(|v| v.camera >= cameras.len() || !(0.0..=1.0).contains(&v.time_norm)) {
             return Err(Error::data(
                 name,
-                format!("a view refers to camera {} of {} at time {}", v.camera, cameras.len(), v.time_norm),
+                format!("a view refers to camera {} of {} at time {}; times are from 0 to 1", v.camera, cameras.len(), v.time_norm),
                 "Check the dataset's index files",
             ));
         }
@@ -259,6 +259,20 @@ mod tests {
         fn load(&self, _: usize) -> Result<Image8> {
             self.loads.fetch_add(1, Ordering::Relaxed);
             Ok(Image8 { width: (self.bytes / 3) as u32, height: 1, channels: 3, data: vec![0; self.bytes] })
+        }
+    }
+
+    #[test]
+    fn views_at_times_outside_0_to_1_are_refused() {
+        let of = |time_norm: f32| {
+            let camera = Camera::look_at("a", (8, 8), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+            let view = View { camera: 0, frame: 0, time_norm, split: Split::Train };
+            Scene::new("s", vec![camera], vec![view], Arc::new(NoImages), 0).map(drop).map_err(|e| e.to_string())
+        };
+        assert!(of(0.0).is_ok() && of(1.0).is_ok());
+        for time_norm in [-0.1, 1.5, f32::NAN, f32::INFINITY] {
+            let error = of(time_norm).unwrap_err();
+            assert!(error.contains(&format!("at time {time_norm}; times are from 0 to 1")), "{error}");
         }
     }
 

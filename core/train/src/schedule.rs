@@ -38,7 +38,8 @@ impl StageLengths {
         }
         let sum: f64 = shares.iter().sum::<f64>().max(1e-9);
         let mut lengths = shares.map(|s| (config.iterations as f64 * s / sum).round() as usize);
-        // Rounding goes to the longest stage, so that the stages add up to the number asked for.
+        // The stages add up to the number asked for: what rounding leaves or takes is in the main stage, or in the score stage where there is no main one.
+        lengths[1] = lengths[1].min(config.iterations.saturating_sub(lengths[0]));
         lengths[2] = config.iterations.saturating_sub(lengths[0] + lengths[1]);
         let mut all = Self {
             lengths,
@@ -202,9 +203,11 @@ mod tests {
 
     #[test]
     fn stages_add_up() {
-        for iterations in [1, 7, 100, 28_000, 60_000] {
-            let lengths = StageLengths::new(&TrainConfig { iterations, ..Default::default() }, true, 1.0);
-            assert_eq!(Stage::ALL.iter().map(|&s| lengths.length(s)).sum::<usize>(), iterations);
+        for shares in [TrainConfig::default().shares, [1.0, 1.0, 0.0], [1.0, 1.0, 1e-9], [0.0, 1.0, 1.0]] {
+            for iterations in [1, 7, 100, 28_000, 60_000] {
+                let lengths = StageLengths::new(&TrainConfig { iterations, shares, ..Default::default() }, true, 1.0);
+                assert_eq!(Stage::ALL.iter().map(|&s| lengths.length(s)).sum::<usize>(), iterations, "shares {shares:?}");
+            }
         }
         let full = StageLengths::new(&TrainConfig::default(), true, 1.0);
         assert_eq!((full.length(Stage::Coarse), full.length(Stage::Score), full.length(Stage::Main)), (5000, 3000, 20_000));

@@ -64,6 +64,17 @@ fn the_length_of_a_main_stage_may_be_set_until_it_is_settled() {
     assert!(resumed("stretched", &sets).unwrap_err().to_string().contains("train.stretch was 1.4 and is 1.0"));
 }
 
+#[test]
+fn going_on_without_a_folder_is_refused() {
+    let (registry, stop) = (Registry::collect().unwrap(), AtomicBool::new(false));
+    let sets = ["scene.width=24", "scene.height=24", "init.count=60", "train.iterations=2"].map(String::from);
+    let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
+    let scene = Arc::new(cc4dgs_train::data::open(Path::new("procedural"), &config.scene, &registry, &config.limits).unwrap());
+    let job = TrainJob { config: &config, scene, out: None, resume: true, registry: &registry, events: &Silent, stop: &stop, observer: None };
+    let error = train(&job).map(|(_, report)| report).unwrap_err();
+    assert!(matches!(&error, Error::Parameter { .. }) && error.to_string().contains("no folder"), "{error}");
+}
+
 /// The checkpoint of a short run with a deformer that keeps attributes, in `folder`.
 fn checkpoint(folder: &Path) -> Vec<u8> {
     let deformer = ["kind=embedding", "gaussian_features=6", "time_features=10", "time_rows=9", "coarse_rows=4", "width=16"];

@@ -1,9 +1,11 @@
-//! Errors that a conformance suite must find: a deformer whose weights are all per-Gaussian attributes, in one correct and several wrong versions.
+//! Errors that conformance suites must find: a deformer whose weights are all per-Gaussian attributes, in one correct and several wrong versions, and plug-ins
+//! with a schema that is not theirs.
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, ExtraAttribute, HostGaussians, Offsets, Parameter, ParameterGroup, Plugin,
-    Registry, Result, Seed, Similarity, SpatialFeatures, SpatialInput, conformance,
+    Appearance, AppearanceContext, AppearancePlugin, AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, DensityPlugin, Error,
+    ExporterPlugin, ExtraAttribute, HostGaussians, LossPlugin, Offsets, OptimizerPlugin, Parameter, ParameterGroup, Part, Plugin, RasterizerPlugin, Registry,
+    Result, Seed, Similarity, SpatialFeatures, SpatialInput, WeightCodecPlugin, conformance,
 };
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, Moving, Player, RenderConfig, default_rasterizer};
@@ -125,6 +127,62 @@ fn mistakes_are_found() {
     }
     let found = findings(with!(None), "speed = 1.0");
     assert!(found.contains("schema"), "a schema that is not the default's TOML:\n{found}");
+}
+
+#[test]
+fn schemas_that_do_not_state_the_defaults_are_found() {
+    let (registry, none, flex) = (Registry::collect().unwrap(), toml::Table::new(), Device::flex());
+    let stating = |info: &Plugin, schema: &'static str| Plugin { schema, ..info.clone() };
+    let (density, loss) = (registry.density("clone-split").unwrap(), registry.loss("photometric").unwrap());
+    let (appearance, optimizer) = (registry.appearance("affine").unwrap(), registry.optimizer("adam").unwrap());
+    let others = [
+        conformance::density(&DensityPlugin { info: stating(&density.info, "min_opacity = 0.5"), build: density.build }, &none, &flex),
+        conformance::loss(&LossPlugin { info: stating(&loss.info, "l1_share = 0.5"), build: loss.build, fuses: None }, &none, &registry, &flex),
+        conformance::appearance(&AppearancePlugin { info: stating(&appearance.info, "lr = 0.5"), build: appearance.build }, &none, &flex),
+        conformance::optimizer(&OptimizerPlugin { info: stating(&optimizer.info, "beta1 = 0.5"), build: optimizer.build }, &none, &flex),
+    ];
+    assert!(others.iter().all(|found| found.len() == 1 && found[0].contains("schema")), "{others:?}");
+    let (rasterizer, exporter) = (registry.rasterizer("tile").unwrap(), registry.exporter("ply").unwrap());
+    let weights = registry.weight_codec("fp16").unwrap();
+    let refused = [
+        conformance::rasterizer(&RasterizerPlugin { info: stating(&rasterizer.info, "tiles = 16"), build: rasterizer.build }, &none, &flex),
+        conformance::exporter(&ExporterPlugin { info: stating(&exporter.info, "text = true"), target: exporter.target, build: exporter.build }, &none),
+        conformance::weight_codec(&WeightCodecPlugin { info: stating(&weights.info, "bits = 16"), build: weights.build }, &none),
+    ];
+    assert!(refused.iter().all(|found| found.len() == 1 && found[0].contains("it refuses the settings that its schema states")), "{refused:?}");
+}
+
+/// A gain per training camera, each an array of its own.
+struct Gains(Vec<Parameter>);
+
+impl Appearance for Gains {
+    fn apply(&self, planes: Tensor<3>, camera: Option<usize>) -> Result<Tensor<3>> {
+        let Some(camera) = camera else { return Ok(planes) };
+        let gain = self.0[camera].value.clone().exp().reshape([1, 1, 1]);
+        Ok(Tensor::cat(vec![planes.clone().narrow(0, 0, 3) * gain, planes.narrow(0, 3, 2)], 0))
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.0.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.0.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        vec![ParameterGroup::plain("gains", 1e-3, 1e-3)]
+    }
+}
+
+fn build_gains(settings: &toml::Table, context: &AppearanceContext, device: &Device) -> Result<Box<dyn Appearance>> {
+    let NoSettings {} = cc4dgs_core::config::parse_section("appearance gains", settings)?;
+    let gain = |camera: usize| Parameter { name: format!("camera-{camera}"), part: Part::Net, shape: vec![1], value: Tensor::zeros([1], device), group: 0 };
+    Ok(Box::new(Gains((0..context.cameras).map(gain).collect())))
+}
+
+#[test]
+fn cameras_may_have_weights_of_their_own() {
+    let info = Plugin { name: "gains", version: "1", summary: "a test", paper: "", schema: "# no settings\n", capabilities: &[] };
+    let plugin = AppearancePlugin { info, build: build_gains };
+    assert_eq!(conformance::appearance(&plugin, &toml::Table::new(), &Device::flex()), Vec::<String>::new());
 }
 
 #[test]

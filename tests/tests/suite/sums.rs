@@ -75,3 +75,15 @@ fn regularizers_of_many_gaussians_do_not_depend_on_threads() {
         field.regularizer(&SpatialInput::new(tensor([MANY.div_ceil(64), 3])), 0.5, 0.5).unwrap().unwrap()
     });
 }
+
+#[test]
+fn regularizers_of_large_planes_do_not_depend_on_threads() {
+    let registry = Registry::collect().unwrap();
+    let build = registry.deformer("hexplane").unwrap().build;
+    check("hexplane", || {
+        // A plane of space has 510 x 512 x 17 second differences, which are more than `MANY`.
+        let large = "resolution = 512\nmultires = [1]\ntime_resolution = 2\nfeatures = 17\nwidth = 4";
+        let field = build(&large.parse().unwrap(), &context(), &Device::flex()).unwrap();
+        field.regularizer(&SpatialInput::new(tensor([1, 3])), 0.5, 0.5).unwrap().unwrap()
+    });
+}

@@ -12,7 +12,25 @@ pub use codec::codec;
 pub use exporter::{MovingModel, export_facts, exporter};
 pub use weight_codec::weight_codec;
 
-use crate::{Error, Result, Seed};
+use crate::{Error, Plugin, Result, Seed, config};
+
+/// What is wrong with how a plug-in reads settings, if anything is: an unknown key must be refused by name, and the schema must be TOML that the plug-in
+/// accepts. `build` builds it, with `settings` and with others; `kind` is that of the plug-in in errors.
+///
+/// # Errors
+/// [`Error::Parameter`] for a schema that is not TOML, and what `build` reports without settings.
+pub fn settings_are_read(kind: &str, info: &Plugin, settings: &toml::Table, build: impl Fn(&toml::Table) -> Result<()>) -> Result<Option<String>> {
+    let mut odd = settings.clone();
+    odd.insert("no_such_setting".into(), 1.into());
+    match build(&odd) {
+        Ok(()) => return Ok(Some("an unknown setting was accepted".into())),
+        Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
+        Err(_) => {}
+    }
+    let stated = config::parse_table(&format!("schema of {kind} {}", info.name), info.schema)?;
+    build(&toml::Table::new())?;
+    Ok(build(&stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
+}
 
 /// The `k`-th random number of `seed`, uniform in -1..1.
 pub fn uniform(seed: Seed, k: usize) -> f32 {

@@ -1,6 +1,6 @@
 //! The conformance suite of weight codecs.
 
-use super::uniform;
+use super::{settings_are_read, uniform};
 use crate::{CodecContext, Limits, Result, Seed, Silent, Stream, WeightArray, WeightCodec, WeightCodecPlugin, WeightSteps};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -9,7 +9,7 @@ const DAMAGES: usize = 48;
 
 /// Tests a weight codec. Each finding is a line; an empty list means that it passed.
 ///
-/// - Unknown settings are refused.
+/// - Its schema is TOML that it accepts; unknown settings are refused by name.
 /// - Names, shapes and their order are kept; the error of every value is at most the declared one.
 /// - Equal weights give equal bytes.
 /// - Where it states its steps, no value is further from what comes back than half of one; so it is with [`CodecContext::weight_importance`], too.
@@ -28,7 +28,7 @@ pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<S
         Ok(Some(finding)) => findings.push(format!("{name}, {check}: {finding}")),
         Err(e) => findings.push(format!("{name}, {check}: {e}")),
     };
-    note("settings", refuses_unknown_settings(plugin, settings));
+    note("settings", settings_are_read("weight codec", &plugin.info, settings, |settings| (plugin.build)(settings).map(drop)));
     note("weights", comes_back(codec, &weights()));
     note("no weights", comes_back(codec, &[]));
     note("steps", keeps_steps(codec, &context()));
@@ -59,16 +59,6 @@ fn weights() -> Vec<WeightArray> {
         array("none", &[0, 5], 1.0),
         WeightArray { name: "zeros".into(), shape: vec![65], values: vec![0.0; 65] },
     ]
-}
-
-fn refuses_unknown_settings(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Result<Option<String>> {
-    let mut settings = settings.clone();
-    settings.insert("no_such_setting".into(), 1.into());
-    Ok(match (plugin.build)(&settings) {
-        Ok(_) => Some("an unknown setting was accepted".into()),
-        Err(e) if !e.to_string().contains("no_such_setting") => Some(format!("the error does not name the unknown setting: {e}")),
-        Err(_) => None,
-    })
 }
 
 fn comes_back(codec: &dyn WeightCodec, given: &[WeightArray]) -> Result<Option<String>> {

@@ -29,6 +29,8 @@ pub fn begins_as_spz(head: &[u8]) -> bool {
 
 /// The flag of models trained with Mip-Splatting's 2D filter.
 const ANTIALIASED: u8 = 1;
+/// The flag of files with vendor extensions. One of them states other axes.
+const EXTENDED: u8 = 2;
 
 /// How an SPZ file is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,7 +97,7 @@ pub fn remarks(gaussians: &HostGaussians, options: &SpzOptions) -> Vec<String> {
     values::remarks(gaussians, options)
 }
 
-/// What an SPZ file of version 2, 3 or 4 holds; dynamic scores are zero. `object` names the file in errors.
+/// What an SPZ file of version 2, 3 or 4 holds; dynamic scores are zero. A remark says where vendor extensions are skipped. `object` names the file in errors.
 ///
 /// # Errors
 /// [`Error::Data`] for invalid files, [`Error::Unsupported`] for other versions, [`Error::Limit`].
@@ -103,7 +105,11 @@ pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<GaussianF
     let packed = if bytes.starts_with(&PLAIN_MAGIC) { frames::read(object, bytes, limits)? } else { gzip::read(object, bytes, limits)? };
     let gaussians = values::unpack(&packed);
     gaussians.validate_read(object, limits)?;
-    Ok(GaussianFile { gaussians, antialiased: packed.flags & ANTIALIASED != 0, remarks: Vec::new() })
+    let mut remarks = Vec::new();
+    if packed.flags & EXTENDED != 0 {
+        remarks.push("vendor extensions are not read; if one states other axes than right, up and back, the model is turned or mirrored".to_string());
+    }
+    Ok(GaussianFile { gaussians, antialiased: packed.flags & ANTIALIASED != 0, remarks })
 }
 
 /// Refuses counts over the limits and headers that no writer makes, before memory is allocated.
@@ -160,6 +166,18 @@ mod tests {
             assert!(four.len() == count && far < 1e-5, "{far}");
         }
         assert!(to_spz(&sample(1, 0), &SpzOptions::version(2)).is_err());
+    }
+
+    #[test]
+    fn extensions_that_are_skipped_are_told() {
+        let mut bytes = to_spz(&sample(5, 1), &SpzOptions::version(4)).unwrap();
+        let read = |bytes: &[u8]| from_spz("t", bytes, &Limits::default()).unwrap();
+        let plain = read(&bytes);
+        assert!(plain.remarks.is_empty());
+        // The flags of the header.
+        bytes[14] |= EXTENDED;
+        let extended = read(&bytes);
+        assert!(extended.remarks[0].contains("vendor extensions are not read") && extended.gaussians == plain.gaussians);
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! The conformance suite of appearance models.
 
-use super::{guarded, settings_are_read, uniform, within};
+use super::{guarded, settings_are_defaults, uniform, within};
 use crate::gaussians::to_vec;
-use crate::{Appearance, AppearanceContext, AppearancePlugin, Result, Seed};
+use crate::{Appearance, AppearanceContext, AppearancePlugin, Parameter, Result, Seed, check_parameters};
 use burn::tensor::{Device, Tensor, TensorData};
 
 /// Planes of the suite `[5,H,W]`.
@@ -51,7 +51,13 @@ fn values(shift: usize) -> Vec<f32> {
 
 impl Suite<'_> {
     fn settings_are_read(&self) -> Result<Option<String>> {
-        settings_are_read("appearance", &self.plugin.info, self.settings, |settings| (self.plugin.build)(settings, &context(), self.device).map(drop))
+        settings_are_defaults("appearance", &self.plugin.info, self.settings, |settings| {
+            let built = Suite { plugin: self.plugin, settings, device: self.device }.shaken(self.device)?;
+            let weights = |p: &&Parameter| Ok((p.name.clone(), p.shape.clone(), to_vec(p.value.clone(), &p.name)?));
+            let weights = built.parameters().iter().map(weights).collect::<Result<Vec<_>>>()?;
+            let term = built.regularizer()?.map(|term| to_vec(term, "regularizer")).transpose()?;
+            Ok((weights, built.groups(), term))
+        })
     }
     fn fresh(&self, device: &Device) -> Result<Box<dyn Appearance>> {
         (self.plugin.build)(self.settings, &context(), device)
@@ -72,15 +78,7 @@ impl Suite<'_> {
     }
     fn parameters_are_sound(&self) -> Result<Option<String>> {
         let built = self.fresh(self.device)?;
-        let mut names = Vec::new();
-        for p in built.parameters() {
-            if p.value.dims()[0] != p.shape.iter().product::<usize>() || p.group >= built.groups().len() {
-                return Ok(Some(format!("{}: {} weights for shape {:?}, group {} of {}", p.name, p.value.dims()[0], p.shape, p.group, built.groups().len())));
-            }
-            names.push(p.name.clone());
-        }
-        names.sort_unstable();
-        Ok(names.windows(2).find(|w| w[0] == w[1]).map(|w| format!("two parameters are called {}", w[0])))
+        check_parameters(self.plugin.info.name, &built.parameters(), &built.groups()).map(|()| None)
     }
     fn identity_where_promised(&self) -> Result<Option<String>> {
         let rendered = values(0);
@@ -107,13 +105,14 @@ impl Suite<'_> {
     fn gradients_are_slopes(&self) -> Result<Option<String>> {
         let device = self.device.clone().autodiff();
         let mut built = self.shaken(&device)?;
-        let weights = Tensor::<3>::from_inner(self.planes(values(1), self.device));
+        let weights: Vec<Tensor<3>> = (0..CAMERAS).map(|camera| Tensor::from_inner(self.planes(values(1 + camera), self.device))).collect();
+        // Every camera takes part: each may have weights of its own.
         let measure = |model: &dyn Appearance, planes: Tensor<3>| -> Result<Tensor<1>> {
-            let loss = (model.apply(planes, Some(1))? * weights.clone()).sum();
-            Ok(match model.regularizer()? {
-                Some(term) => loss + term,
-                None => loss,
-            })
+            let mut loss = model.regularizer()?.unwrap_or_else(|| Tensor::zeros([1], &device));
+            for (camera, weights) in weights.iter().enumerate() {
+                loss = loss + (model.apply(planes.clone(), Some(camera))? * weights.clone()).sum();
+            }
+            Ok(loss)
         };
         let planes = self.planes(values(0), &device).require_grad();
         let gradients = measure(built.as_ref(), planes.clone())?.backward();

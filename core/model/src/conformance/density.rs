@@ -3,6 +3,7 @@
 use super::{guarded, settings_are_read, uniform};
 use crate::{
     DensityControl, DensityPlan, DensityPlugin, Error, ExtraAttribute, Gaussians, HostGaussians, Result, Schedule, Seed, Stage, Statistic, ViewStatistics,
+    config,
 };
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
@@ -21,7 +22,7 @@ const LABEL: &str = "conformance-label";
 /// - Plans refer to existing rows and attributes, set finite values, and never remove all Gaussians; half of what they remove is kept, as the trainer may.
 /// - Equal seeds give equal plans. State stored after any iteration continues with the same plans.
 /// - Stored state of another size is an error.
-/// - Gaussians without statistics, a single Gaussian, and centres that are not finite give plans or errors.
+/// - Gaussians without statistics, a single Gaussian, and centres and opacities that are not finite give plans or errors.
 pub fn density(plugin: &DensityPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
     guarded(
@@ -137,9 +138,14 @@ impl Suite<'_> {
         Ok(run)
     }
     fn plans_are_sound(&self) -> Result<Option<String>> {
-        let (first, second) = (self.run(None)?, self.run(None)?);
+        // `config.toml` is completed from the schema, so that its settings must do what no settings do.
+        let stated = config::parse_table(&format!("schema of density {}", self.plugin.info.name), self.plugin.info.schema)?;
+        let (settings, of) = if self.settings.is_empty() { (&stated, ", one of them with the settings of its schema,") } else { (self.settings, "") };
+        let again = Suite { plugin: self.plugin, settings, device: self.device };
+        let (first, second) = (self.run(None)?, again.run(None)?);
+        let differ = |what: &str| Ok(Some(format!("two runs with equal seeds{of} give different {what}")));
         if first.plans != second.plans {
-            return Ok(Some("two runs with equal seeds give different plans".into()));
+            return differ("plans");
         }
         if first.end.len() > MOST {
             return Ok(Some(format!("{COUNT} Gaussians became {} in {} iterations", first.end.len(), 2 * ITERATIONS)));
@@ -147,6 +153,9 @@ impl Suite<'_> {
         let host = first.end.to_host()?;
         if let Err(e) = host.validate("Gaussians after all plans", &crate::Limits::default()) {
             return Ok(Some(e.to_string()));
+        }
+        if second.end.to_host()? != host {
+            return differ("Gaussians");
         }
         let labels = host.extra.get(LABEL).map(|a| a.values.clone()).unwrap_or_default();
         let inherited = labels.len() == host.len() && labels.iter().all(|&l| l.fract() == 0.0 && (0.0..COUNT as f32).contains(&l));
@@ -174,8 +183,10 @@ impl Suite<'_> {
         Ok(self.build()?.restore(renamed, COUNT).is_ok().then(|| "stored state with an unknown array was accepted".into()))
     }
     fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
-        let mut odd = self.gaussians(3);
-        odd.means = Tensor::from_floats([[f32::NAN, 0.0, 0.0], [f32::INFINITY, 0.0, 0.0], [0.0, 0.0, 0.0]], self.device);
+        let mut odd = self.gaussians(5);
+        odd.means = Tensor::from_floats([[f32::NAN, 0.0, 0.0], [f32::INFINITY, 0.0, 0.0], [0.0; 3], [0.0; 3], [0.0; 3]], self.device);
+        // A faint one has something to gain from the others, and one whose opacity is not a number has nothing to give.
+        odd.opacity_logits = Tensor::from_floats([2.0, 2.0, -8.0, f32::NAN, 2.0], self.device);
         for gaussians in [self.gaussians(1), odd] {
             let mut control = self.build()?;
             let mut gaussians = gaussians;

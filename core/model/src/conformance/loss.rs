@@ -1,6 +1,6 @@
 //! The conformance suite of loss terms.
 
-use super::{guarded, settings_are_read, uniform, within};
+use super::{guarded, settings_are_defaults, uniform, within};
 use crate::gaussians::to_vec;
 use crate::{Gaussians, HostGaussians, LossInput, LossPlugin, LossTerm, Registry, Result, Schedule, Seed};
 use burn::tensor::{Device, Int, Tensor, TensorData};
@@ -80,7 +80,8 @@ fn inputs(size: [usize; 2], count: usize) -> Inputs {
 
 impl Suite<'_> {
     fn settings_are_read(&self) -> Result<Option<String>> {
-        settings_are_read("loss", &self.plugin.info, self.settings, |settings| (self.plugin.build)(settings).map(drop))
+        let value = |settings: &toml::Table| self.number((self.plugin.build)(settings)?.as_ref(), &inputs(SIZE, COUNT));
+        settings_are_defaults("loss", &self.plugin.info, self.settings, value)
     }
     fn term(&self) -> Result<Box<dyn LossTerm>> {
         (self.plugin.build)(self.settings)

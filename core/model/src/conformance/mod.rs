@@ -26,7 +26,7 @@ pub use reader::reader;
 
 use crate::{Plugin, Result, Seed, config};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_format::conformance::uniform;
+use cc4dgs_format::conformance::{settings_are_read, uniform};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// A check with its name; it returns a finding, if any.
@@ -47,18 +47,20 @@ fn guarded(subject: &str, checks: Vec<Check>) -> Vec<String> {
     findings
 }
 
-/// Settings are read strictly: an unknown key is refused by name, and the schema, from which `config.toml` is written in full, is TOML that the plug-in accepts.
-fn settings_are_read(kind: &str, info: &Plugin, settings: &toml::Table, build: impl Fn(&toml::Table) -> Result<()>) -> Result<Option<String>> {
-    let mut odd = settings.clone();
-    odd.insert("no_such_setting".into(), 1.into());
-    match build(&odd) {
-        Ok(()) => return Ok(Some("an unknown setting was accepted".into())),
-        Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
-        Err(_) => {}
+/// What is wrong with the settings of a plug-in that has a section in `config.toml`, if anything is: see [`settings_are_read`]. The section is completed from
+/// the schema, so that the schema's settings must do what no settings do. `observed` builds the plug-in with settings and returns what it does.
+fn settings_are_defaults<T: PartialEq>(
+    kind: &str,
+    info: &Plugin,
+    settings: &toml::Table,
+    observed: impl Fn(&toml::Table) -> Result<T>,
+) -> Result<Option<String>> {
+    if let Some(finding) = settings_are_read(kind, info, settings, |settings| observed(settings).map(drop))? {
+        return Ok(Some(finding));
     }
     let stated = config::parse_table(&format!("schema of {kind} {}", info.name), info.schema)?;
-    build(&toml::Table::new())?;
-    Ok(build(&stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
+    let differs = observed(&toml::Table::new())? != observed(&stated)?;
+    Ok(differs.then(|| "with the settings that its schema states it does something else than with none".into()))
 }
 
 /// Whether `value` is at most `most` away from 0; a value that is no number is not.

@@ -1,6 +1,6 @@
 //! The conformance suite of optimizers.
 
-use super::{guarded, matrix, settings_are_read};
+use super::{guarded, matrix, settings_are_defaults};
 use crate::gaussians::to_vec;
 use crate::{Error, Optimizer, OptimizerPlugin, Result, Seed, StepSettings};
 use burn::tensor::{Device, Int, Tensor};
@@ -49,7 +49,8 @@ impl Suite<'_> {
         (self.plugin.build)(self.settings)
     }
     fn settings_are_read(&self) -> Result<Option<String>> {
-        settings_are_read("optimizer", &self.plugin.info, self.settings, |settings| (self.plugin.build)(settings).map(drop))
+        let steps = |settings: &toml::Table| to_vec(self.descend((self.plugin.build)(settings)?.as_mut(), self.start(), 5)?, "values");
+        settings_are_defaults("optimizer", &self.plugin.info, self.settings, steps)
     }
     fn start(&self) -> Tensor<2> {
         matrix(Seed::root(71), SHAPE[0], SHAPE[1], self.device)

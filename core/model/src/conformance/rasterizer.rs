@@ -2,7 +2,7 @@
 
 mod probes;
 
-use super::uniform;
+use super::{settings_are_defaults, uniform};
 use crate::gaussians::to_vec;
 use crate::{Camera, Gaussians, HostGaussians, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, Seed, Splats};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -16,7 +16,7 @@ const SLOPE_TOLERANCE: f64 = 0.05;
 
 /// Tests a rasterizer on `device`. Each finding is a line; an empty list means that it passed.
 ///
-/// - Unknown settings are refused.
+/// - Its schema is TOML and states the defaults; unknown settings are refused by name.
 /// - Without Gaussians, the image is the background.
 /// - At the centre of a Gaussian in the middle of the image, the image has its colour and opacity.
 /// - Gaussians behind the camera, and those that are not finite, are not drawn; their radius is 0.
@@ -29,8 +29,9 @@ pub fn rasterizer(plugin: &RasterizerPlugin, settings: &toml::Table, device: &De
         Err(e) => return vec![format!("{name}: it cannot be built: {e}")],
     };
     let suite = Suite { rasterizer: rasterizer.as_ref(), device };
+    let drawn = |settings: &toml::Table| Suite { rasterizer: (plugin.build)(settings)?.as_ref(), device }.planes(&cloud(COUNT));
     let checks: [(&str, Result<Option<String>>); 8] = [
-        ("settings", refuses_unknown_settings(plugin, settings)),
+        ("settings", settings_are_defaults("rasterizer", &plugin.info, settings, drawn)),
         ("background", suite.nothing_is_background()),
         ("one Gaussian", suite.one_gaussian_is_itself()),
         ("odd Gaussians", suite.odd_gaussians_are_left_out()),
@@ -57,12 +58,6 @@ struct Suite<'a> {
 /// Whether one of the finite differences along a gradient agrees with the gradient's norm.
 fn agrees(slopes: &[f64], norm: f64) -> bool {
     slopes.iter().any(|slope| (slope / norm - 1.0).abs() <= SLOPE_TOLERANCE)
-}
-
-fn refuses_unknown_settings(plugin: &RasterizerPlugin, settings: &toml::Table) -> Result<Option<String>> {
-    let mut settings = settings.clone();
-    settings.insert("no_such_setting".into(), 1.into());
-    Ok((plugin.build)(&settings).is_ok().then(|| "an unknown setting was accepted".into()))
 }
 
 fn camera() -> Camera {

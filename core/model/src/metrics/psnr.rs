@@ -40,12 +40,28 @@ pub fn mean_absolute_error(a: &Planes, b: &Planes, mask: Option<&[bool]>) -> Res
     mean(a, b, mask, |x, y| (x - y).abs())
 }
 
-/// 10 log10(1 / MSE) in dB for data range 1; at most [`PSNR_CEILING_DB`], which is that of an MSE of 0.
+/// 10 log10(1 / MSE) in dB for data range 1; at most [`PSNR_CEILING_DB`], which is that of an MSE of 0. Minus infinity of an MSE that is not a number.
 pub fn psnr_of_mean_squared_error(mse: f64) -> f64 {
-    if mse > 0.0 { (-10.0 * mse.log10()).min(PSNR_CEILING_DB) } else { PSNR_CEILING_DB }
+    if mse.is_nan() {
+        f64::NEG_INFINITY
+    } else if mse > 0.0 {
+        (-10.0 * mse.log10()).min(PSNR_CEILING_DB)
+    } else {
+        PSNR_CEILING_DB
+    }
 }
 
 /// 10 log10(1 / MSE) in dB for data range 1, the MSE taken over all channels and pixels at once; at most [`PSNR_CEILING_DB`].
 pub fn psnr(a: &Planes, b: &Planes, mask: Option<&[bool]>) -> Result<f64> {
     Ok(psnr_of_mean_squared_error(mean_squared_error(a, b, mask)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_that_is_no_number_is_not_the_best_score() {
+        assert_eq!([0.0, 1.0, f64::NAN].map(psnr_of_mean_squared_error), [PSNR_CEILING_DB, 0.0, f64::NEG_INFINITY]);
+    }
 }

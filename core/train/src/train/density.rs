@@ -3,6 +3,7 @@
 use super::guard::broken_rows;
 use super::{Context, TrainState};
 use crate::gaussian_set::GaussianSet;
+use burn::tensor::Tensor;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Error, Event, Result, Schedule};
 use cc4dgs_play::Moving;
@@ -35,6 +36,16 @@ pub(super) fn moving_first(plan: &mut DensityPlan, state: &TrainState) -> Result
     Ok(())
 }
 
+/// Refuses `values` of the attribute `name` that the density control `kind` returned from `after_step`, where they do not fit the Gaussians.
+fn check_step(kind: &str, set: &GaussianSet, name: &str, values: &Tensor<2>) -> Result<()> {
+    let problem = match set.get(name).map(|old| old.dims()) {
+        Ok(dims) if dims == values.dims() => return Ok(()),
+        Ok(dims) => format!("after_step returned '{name}' of shape {:?}, and the Gaussians have {dims:?}", values.dims()),
+        Err(_) => format!("after_step returned '{name}', which the Gaussians do not have"),
+    };
+    Err(Error::backend(format!("density control {kind}"), problem, "Correct the control, or choose another"))
+}
+
 impl Context<'_> {
     /// How many Gaussians key frames or recovery may add where there are `now`: as many as `density.max_gaussians` leaves, or [`least_places`] if that is more. `None`
     /// for density controls without such a bound.
@@ -50,10 +61,7 @@ impl Context<'_> {
         let index = schedule.iteration as u64;
         let gaussians = state.set.gaussians()?;
         for (name, values) in state.density.after_step(&gaussians, schedule, seed.child("density noise").index(index))? {
-            if values.dims()[0] != state.set.len() {
-                let problem = format!("after_step returned {} rows of '{name}' for {} Gaussians", values.dims()[0], state.set.len());
-                return Err(Error::backend(format!("density control {kind}"), problem, "Correct the control, or choose another"));
-            }
+            check_step(kind, &state.set, &name, &values)?;
             state.set.set(&name, values)?;
             if name == SCORES {
                 state.invalidate_rows();
@@ -129,5 +137,30 @@ impl Context<'_> {
             gaussians,
         });
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+    use cc4dgs_core::HostGaussians;
+
+    #[test]
+    fn values_that_do_not_fit_name_the_control() {
+        let device = Device::flex();
+        let mut host = HostGaussians { opacity_logits: vec![0.0; 2], ..Default::default() };
+        host.columns_mut().into_iter().for_each(|(_, width, values)| values.resize(2 * width, 0.0));
+        let set = GaussianSet::new(&host, &device);
+        let check = |name: &str, shape: [usize; 2]| check_step("mine", &set, name, &Tensor::zeros(shape, &device)).map_err(|e| e.to_string());
+        assert_eq!(check("means", [2, 3]), Ok(()));
+        for (name, shape, expected) in [
+            ("means", [3, 3], "'means' of shape [3, 3], and the Gaussians have [2, 3]"),
+            ("means", [2, 1], "'means' of shape [2, 1], and the Gaussians have [2, 3]"),
+            ("opacities", [2, 1], "'opacities', which the Gaussians do not have"),
+        ] {
+            let message = check(name, shape).unwrap_err();
+            assert!(message.starts_with("density control mine: after_step returned ") && message.contains(expected), "{message}");
+        }
     }
 }

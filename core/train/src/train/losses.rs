@@ -47,8 +47,9 @@ impl LossTerms {
     /// The weighted sum `[1]` for one view.
     pub fn value(&self, input: &LossInput) -> Result<Tensor<1>> {
         let mut total: Option<Tensor<1>> = None;
-        for Term { weight, term, .. } in &self.0 {
+        for Term { name, weight, term } in &self.0 {
             let Some(value) = term.value(input)? else { continue };
+            let value = single(&format!("loss term {name}"), value)?;
             let value = if *weight == 1.0 { value } else { value.mul_scalar(*weight) };
             total = Some(match total {
                 Some(sum) => sum + value,
@@ -70,6 +71,14 @@ impl LossTerms {
     }
 }
 
+/// Refuses a `term` of the loss that is not one number: added to the others, it would count as often as it has numbers. `object` names it in errors.
+pub(crate) fn single(object: &str, term: Tensor<1>) -> Result<Tensor<1>> {
+    match term.dims() {
+        [1] => Ok(term),
+        [count] => Err(Error::parameter(object, format!("its value has {count} numbers"), "Return one number [1], such as the mean")),
+    }
+}
+
 fn read(section: &toml::Table) -> Result<Listed> {
     let (kind, mut settings) = split_kind("loss", section)?;
     let weight = match settings.remove("weight") {
@@ -82,4 +91,33 @@ fn read(section: &toml::Table) -> Result<Listed> {
         return Err(Error::parameter(format!("loss {kind}: weight"), format!("{weight} cannot be used"), "Give a finite number of 0 or more"));
     }
     Ok(Listed { kind, weight, settings })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::{Device, Int};
+    use cc4dgs_core::{Gaussians, HostGaussians, Schedule};
+
+    /// As many ones.
+    struct Ones(usize);
+
+    impl LossTerm for Ones {
+        fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
+            Ok(Some(Tensor::ones([self.0], &input.planes.device())))
+        }
+    }
+
+    #[test]
+    fn a_term_that_is_not_one_number_is_named() {
+        let device = Device::flex();
+        let (planes, target) = (Tensor::<3>::zeros([5, 2, 2], &device), Tensor::<3>::zeros([3, 2, 2], &device));
+        let none = HostGaussians { sh_degree: 1, ..Default::default() };
+        let (gaussians, radii) = (Gaussians::from_host(&none, &device), Tensor::<1, Int>::zeros([1], &device));
+        let input = LossInput { planes: &planes, target: &target, gaussians: &gaussians, radii: &radii, time_norm: 0.5, schedule: &Schedule::main(1) };
+        let of = |numbers: usize| LossTerms(vec![Term { name: "mine".into(), weight: 0.5, term: Box::new(Ones(numbers)) }]).value(&input);
+        assert_eq!(of(1).unwrap().into_scalar::<f32>(), 0.5);
+        let message = of(4).unwrap_err().to_string();
+        assert!(message.starts_with("loss term mine: its value has 4 numbers"), "{message}");
+    }
 }

@@ -79,7 +79,7 @@ pub struct TrainJob<'a> {
     pub scene: Arc<Scene>,
     /// The run's folder, created if missing; `None` writes nothing.
     pub out: Option<PathBuf>,
-    /// Continue from the folder's checkpoint.
+    /// Continue from the checkpoint of the folder, which must be given.
     pub resume: bool,
     /// Where plug-ins are found.
     pub registry: &'a Registry,
@@ -151,10 +151,10 @@ pub(crate) struct Context<'a> {
 /// Trains. With a folder, `config.toml` and `checkpoint` are written into it.
 ///
 /// # Errors
-/// [`Error::Parameter`] for settings out of range, before anything is written, [`Error::Interrupted`] after `stop` was set (a checkpoint is written first),
-/// [`Error::Backend`] when loss or parameters do not stay finite even with lower rates, [`Error::Data`] for a scene that cannot be reconstructed,
-/// [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own earlier scores (the checkpoint is kept), and whatever the
-/// scene, the plug-ins or the disk report.
+/// [`Error::Parameter`] for settings out of range, before anything is written, and for going on without a folder, [`Error::Interrupted`] after `stop` was set
+/// (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with lower rates, [`Error::Data`] for a scene that
+/// cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own earlier scores (the checkpoint is
+/// kept), and whatever the scene, the plug-ins or the disk report.
 ///
 /// [`Error::Parameter`]: cc4dgs_core::Error::Parameter
 /// [`Error::Interrupted`]: cc4dgs_core::Error::Interrupted
@@ -169,6 +169,10 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
 fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let began = Instant::now();
     job.config.validate()?;
+    if job.resume && job.out.is_none() {
+        let problem = "there is no folder, and so no checkpoint to go on from";
+        return Err(cc4dgs_core::Error::parameter("resume", problem, "Give the folder of the run, or begin a new one"));
+    }
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
     let scene = hold_out(&job.scene, config.train.validation)?;
     let job = &TrainJob { config, scene: Arc::new(scene), out: job.out.clone(), ..*job };

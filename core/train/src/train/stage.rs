@@ -8,7 +8,7 @@ use super::{Context, TrainState};
 use crate::checkpoint;
 use crate::checks::Watch;
 use crate::config::CoarseFrames;
-use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage, check_attributes};
+use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use std::collections::BTreeMap;
@@ -154,7 +154,6 @@ impl Context<'_> {
         let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
         let field = self.job.registry.build_deformer(section, &context, &self.device)?;
         let deformer = ModelDeformer { field, section: section.clone(), context };
-        check_attributes(deformer.name(), &deformer.field.attributes())?;
         state.set.add_attributes(&deformer.field.attributes(), self.seed.child("attributes"))?;
         let moves = !deformer.field.is_static() && state.moving_rows(&self.device)?.count() > 0;
         if !moves && !deformer.field.is_static() && state.moving != Moving::Nothing {

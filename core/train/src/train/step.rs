@@ -3,6 +3,7 @@
 use super::capacity::Drawn;
 use super::dropout;
 use super::log::Log;
+use super::losses::single;
 use super::probe::psnr_db;
 use super::rounded::{ExactWeights, Rounded};
 use super::smoothness::{flicker, smoothness};
@@ -175,11 +176,11 @@ impl Context<'_> {
                 }
             }
             if let Some(term) = deformer.field.regularizer(&spatial.input, time_norm, progress as f32)? {
-                loss = loss + term;
+                loss = loss + single(&format!("regularizer of deformer {}", deformer.name()), term)?;
             }
         }
         if let Some(term) = state.appearance.regularizer()? {
-            loss = loss + term;
+            loss = loss + single("regularizer of the appearance model", term)?;
         }
         if read || check {
             let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);

@@ -1,6 +1,6 @@
-//! `half`: every attribute as 16-bit floats, in order. A codec needs nothing but `cc4dgs-format`.
+//! `half`: every attribute as 16-bit floats, in order; as float32 where those would lose too much. A codec needs nothing but `cc4dgs-format`.
 
-use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, open};
+use cc4dgs_format::storage::{Attributes, META, Shape, column_loss, extra_streams, open};
 use cc4dgs_format::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, toml, unknown_name,
 };
@@ -8,8 +8,11 @@ use half::f16;
 
 /// Version of the stored form.
 const VERSION: u8 = 1;
-/// Sixteen bits keep eleven of a number; columns whose mean is far from zero lose more of their deviation.
+/// The promise, which holds for any input: sixteen bits keep eleven of a number, and columns whose mean is far from zero would lose more of their deviation.
 const LOSS: f64 = 0.02;
+/// How the values of a column are stored.
+const HALF: u8 = 0;
+const FLOAT: u8 = 1;
 const COLUMNS: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 
 struct Half;
@@ -19,28 +22,35 @@ impl AttributeCodec for Half {
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let mut meta = vec![VERSION];
         Shape::of(gaussians).write(&mut meta)?;
-        let mut streams = vec![Stream { name: META.into(), bytes: meta }];
-        for (name, _, values) in gaussians.columns() {
-            if let Some(v) = values.iter().find(|v| !f16::from_f32(**v).is_finite()) {
-                return Err(Error::parameter(format!("codec half: {name}"), format!("{v} is beyond 65,504"), "Use another codec"));
-            }
-            streams.push(Stream { name: name.into(), bytes: values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()).collect() });
+        let mut streams = Vec::new();
+        for (name, width, values) in gaussians.columns() {
+            let halves: Vec<f16> = values.iter().map(|v| f16::from_f32(*v)).collect();
+            let decoded: Vec<f32> = halves.iter().map(|v| v.to_f32()).collect();
+            // A value beyond 65,504 would become infinite, and the loss with it.
+            let kept = column_loss(name, values, &decoded, width) <= LOSS;
+            meta.push(if kept { HALF } else { FLOAT });
+            let bytes = if kept { halves.iter().flat_map(|v| v.to_le_bytes()).collect() } else { values.iter().flat_map(|v| v.to_le_bytes()).collect() };
+            streams.push(Stream { name: name.into(), bytes });
         }
+        streams.push(Stream { name: META.into(), bytes: meta });
         // What other plug-ins keep per Gaussian survives as far as they ask for.
         streams.extend(extra_streams(gaussians, Attributes::AsAllowed));
         Ok(streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
         // Checks the claimed counts against the limits before anything is allocated for them.
-        let (set, meta, shape) = open("half", streams, VERSION, &context.limits)?;
-        meta.finish()?;
+        let (set, mut meta, shape) = open("half", streams, VERSION, &context.limits)?;
         let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
         for (name, width, values) in out.columns_mut() {
-            let mut stream = set.reader(name)?;
-            let bytes = stream.take(shape.count.saturating_mul(2 * width))?;
-            *values = bytes.as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32()).collect();
+            let (mut stream, count) = (set.reader(name)?, shape.count.saturating_mul(width));
+            *values = match meta.u8()? {
+                HALF => stream.take(count.saturating_mul(2))?.as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32()).collect(),
+                FLOAT => stream.f32s(count)?,
+                other => return Err(meta.error(format!("{name} is stored in form {other}, which is none"))),
+            };
             stream.finish()?;
         }
+        meta.finish()?;
         shape.read_extra(&set, &mut out)?;
         out.validate_read("decoded Gaussians", &context.limits)?;
         Ok(out)
