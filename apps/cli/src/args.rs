@@ -170,7 +170,7 @@ pub struct ModelViews {
     /// Which side of its split.
     #[arg(long, value_enum, default_value_t = SplitArg::Test)]
     pub split: SplitArg,
-    /// Scene options over those the model was trained with, such as scene.width=800 (0 is the images' own size); may be given several times.
+    /// Scene options over those the model was trained with, such as scene.width=800 (0 is the images' own size, the largest); may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
 }
@@ -273,7 +273,7 @@ pub struct Stress {
 pub enum SplitArg {
     /// Images seen in training.
     Train,
-    /// Images kept out by train.validation, to choose settings by.
+    /// Images to choose settings by: those of the dataset, or those that train.validation kept out of training.
     Validation,
     /// Images held out.
     Test,

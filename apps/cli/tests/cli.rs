@@ -146,6 +146,9 @@ fn a_scene_goes_through_the_whole_chain() {
     succeed(&[&measure[..], &["--sheet", text(&sheet)]].concat());
     succeed(&draw);
     assert!(fail(&draw, 2).contains("--overwrite"));
+    // Renders stay where a command has none to put in their place.
+    assert!(fail(&[&draw[..], &["--overwrite", "--split", "validation"]].concat(), 2).contains("no view of split"));
+    assert_eq!(std::fs::read_dir(&renders).unwrap().count(), 5, "four renders and the mark of the folder");
     succeed(&[&draw[..], &["--overwrite", "--max-views", "1"]].concat());
     assert_eq!(std::fs::read_dir(&renders).unwrap().count(), 2, "a render and the mark of the folder");
     assert!(fail(&[&measure[..], &["--renders", text(&dir), "--overwrite"]].concat(), 2).contains("is not a render"));

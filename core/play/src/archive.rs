@@ -120,6 +120,7 @@ impl Model {
     fn archive_writer(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<ArchiveWriter> {
         let ArchiveOptions { codec: spec, settings, field_weights, scene, tuner } = *options;
         self.check_size(limits)?;
+        self.check_storable()?;
         let tuner = tuner.map(EncodedOnce::new);
         let tuner = tuner.as_ref().map(|tuner| tuner as &dyn TuneModel);
         let codec = registry.build_codec(spec, settings)?;
@@ -139,13 +140,7 @@ impl Model {
             }),
             ..CodecContext::new(seed, *limits, events)
         };
-        // A field that moves nothing is not stored.
-        let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
-        let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
-        if field.is_some_and(|f| f.name() == PLAYBACK_LAYER) {
-            let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
-            return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
-        }
+        let (movable, field) = (self.movable(), self.stored_field());
         let weights = field.map(|f| StoredField::new(f, field_weights, registry)).transpose()?;
         let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
         let moving = if movable { self.moving } else { Moving::Nothing };
@@ -216,6 +211,25 @@ impl Model {
             None => untuned.into_inner().map_or_else(encode_weights, Ok)?,
         };
         Ok(assembled(streams, &found))
+    }
+    /// Refuses a model that a playback layer alone moves, which cannot be stored again. Call it before long work.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`].
+    pub fn check_storable(&self) -> Result<()> {
+        if self.stored_field().is_none_or(|f| f.name() != PLAYBACK_LAYER) {
+            return Ok(());
+        }
+        let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
+        Err(Error::unsupported("the model", problem, "Take the run, or an archive that was baked without --without-field"))
+    }
+    /// Whether a deformer may move some of the Gaussians.
+    fn movable(&self) -> bool {
+        self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty())
+    }
+    /// The deformer that archives store: none that moves nothing.
+    fn stored_field(&self) -> Option<&ModelDeformer> {
+        self.field.as_ref().filter(|f| self.movable() && !f.field.is_static())
     }
     /// Refuses Gaussians that no reader with these limits accepts, before they are encoded.
     fn check_size(&self, limits: &Limits) -> Result<()> {

@@ -90,22 +90,22 @@ impl Model {
     /// plug-ins this program does not have, [`Error::Limit`] for claims over `limits`.
     pub fn open(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let Source { kind, file } = Source::expect(path)?;
+        let of_static = |found: GaussianFile, bytes: u64| {
+            for message in &found.remarks {
+                events.emit(&Event::Note { object: file.display().to_string(), message: message.clone() });
+            }
+            Self::from_static(found, bytes)
+        };
         match kind {
             SourceKind::Checkpoint => checkpoint::read_model(&file, registry, device, limits),
             SourceKind::Archive => {
                 let archive = Archive::open(&file, limits)?;
                 Self::of_archive(&file.display().to_string(), &archive, registry, device, limits, events)
             }
-            SourceKind::Ply => {
-                let found = ply::read_file(&file, limits)?;
-                for message in &found.remarks {
-                    events.emit(&Event::Note { object: file.display().to_string(), message: message.clone() });
-                }
-                Ok(Self::from_static(found, file_bytes(&file)?))
-            }
+            SourceKind::Ply => Ok(of_static(ply::read_file(&file, limits)?, file_bytes(&file)?)),
             SourceKind::Spz => {
                 let content = limits.read_file(&file)?;
-                Ok(Self::from_static(spz::from_spz(&file.display().to_string(), &content, limits)?, content.len() as u64))
+                Ok(of_static(spz::from_spz(&file.display().to_string(), &content, limits)?, content.len() as u64))
             }
         }
     }
@@ -148,4 +148,34 @@ impl Model {
 
 fn file_bytes(path: &Path) -> Result<u64> {
     Ok(std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len())
+}
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Recorder;
+
+    #[test]
+    fn what_is_not_read_of_an_spz_file_is_told() {
+        let gaussians = HostGaussians {
+            means: vec![0.0; 3],
+            log_scales: vec![-3.0; 3],
+            quaternions: vec![1.0, 0.0, 0.0, 0.0],
+            opacity_logits: vec![2.0],
+            sh_dc: vec![0.1; 3],
+            dynamic_scores: vec![0.0],
+            ..Default::default()
+        };
+        let mut bytes = spz::to_spz(&gaussians, &spz::SpzOptions::version(4)).unwrap();
+        // The flag of vendor extensions.
+        bytes[14] |= 2;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.spz");
+        std::fs::write(&path, bytes).unwrap();
+        let events = Recorder::default();
+        let model = Model::open(&path, &Registry::collect().unwrap(), &Device::flex(), &Limits::default(), &events).unwrap();
+        assert_eq!(model.gaussians.len(), 1);
+        let told = events.events();
+        assert!(matches!(told.as_slice(), [Event::Note { message, .. }] if message.contains("vendor extensions")), "{told:?}");
+    }
 }

@@ -27,7 +27,7 @@ pub struct PruneReport {
     /// PSNR in dB of all Gaussians after one re-fit, nothing removed: what training alone gives. Missing without re-fit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_refit_alone_db: Option<f64>,
-    /// Which views judged: validation views where the model was trained with some, else training views.
+    /// Which views judged: validation views where the scene has some, else training views.
     pub judged_by: Split,
     /// Number of those views.
     pub views: usize,

@@ -28,7 +28,7 @@ pub struct Agreement {
     pub max_difference: f32,
     /// Mean difference.
     pub mean_difference: f64,
-    /// Differences below which this share lies, to a tenth of an 8-bit level: 0.5, 0.99, 0.9999, 0.999999.
+    /// Differences below which this share lies, to a tenth of an 8-bit level, and the largest one where that is over four levels: 0.5, 0.99, 0.9999, 0.999999.
     pub quantiles: [f32; 4],
     /// Values compared.
     pub values: u64,
@@ -75,7 +75,8 @@ impl Agreement {
                 seen += count;
                 seen >= wanted
             });
-            bin.map_or(self.max_difference, |bin| ((bin + 1) as f32 * 0.1 * LEVEL).min(self.max_difference))
+            // The last bin has all larger differences.
+            bin.filter(|bin| *bin < BINS).map_or(self.max_difference, |bin| ((bin + 1) as f32 * 0.1 * LEVEL).min(self.max_difference))
         });
     }
 }
@@ -123,5 +124,13 @@ mod tests {
         assert!((a.max_difference - 2.0 * LEVEL).abs() < 1e-6 && (a.quantiles[0] - 0.1 * LEVEL).abs() < 1e-6, "{a:?}");
         a.add(&[f32::NAN], &[0.0]);
         assert_eq!(a.max_difference, f32::INFINITY);
+    }
+
+    #[test]
+    fn quantiles_are_not_below_what_they_stand_for() {
+        let mut a = Agreement::new("x");
+        a.add(&[0.0; 10], &[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 0.5]);
+        a.finish();
+        assert_eq!(a.quantiles, [0.1 * LEVEL, 0.5, 0.5, 0.5]);
     }
 }

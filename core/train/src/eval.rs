@@ -6,7 +6,7 @@ use crate::masks::{PUBLISHED_SIGMA, dynamic_masks};
 use crate::sample::spread_views;
 use burn::tensor::Device;
 use cc4dgs_core::metrics::{FLIP_PIXELS_PER_DEGREE, FrameSet, Metric, Rounding, SsimConvention, installed_lpips};
-use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
+use cc4dgs_core::{Error, Event, EventSink, Image8, Registry, Result, Scene, Split};
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::player::{FrameTime, PlayWork};
 use cc4dgs_play::{Model, Player};
@@ -153,6 +153,18 @@ impl Scored {
         let all = scene.split(self.split);
         if self.max_views == 0 { all } else { spread_views(scene, &all, self.max_views) }
     }
+    /// Refuses a scene without views of the split. Call it before anything is replaced.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`].
+    pub fn check(&self, scene: &Scene) -> Result<()> {
+        if !scene.split(self.split).is_empty() {
+            return Ok(());
+        }
+        let problem = format!("{} has no view of split {:?}", scene.name, self.split);
+        let remedy = "Evaluate another split; there are validation views where the dataset has some, or the model was trained with train.validation";
+        Err(Error::parameter("--split", problem, remedy))
+    }
 }
 
 /// What [`evaluate`] hands to `on_image`: the view, the truth, the render, and their score.
@@ -162,7 +174,7 @@ pub type OnImage<'a> = dyn FnMut(usize, &Image8, &Image8, &ImageScore) -> Result
 /// scene's.
 ///
 /// # Errors
-/// [`cc4dgs_core::Error::Parameter`] for a split without views, and what scene, field, rasterizer and `on_image` report.
+/// [`Error::Parameter`] for a split without views, and what scene, field, rasterizer and `on_image` report.
 pub fn evaluate(
     model: &Model,
     scene: &Scene,
@@ -173,14 +185,8 @@ pub fn evaluate(
     on_image: &mut OnImage,
 ) -> Result<EvalReport> {
     let Scored { split, perceptual, .. } = scored;
+    scored.check(scene)?;
     let (views, in_split) = (scored.views(scene), scene.split(split).len());
-    if views.is_empty() {
-        return Err(cc4dgs_core::Error::parameter(
-            "--split",
-            format!("{} has no view of split {split:?}", scene.name),
-            "Evaluate another split; validation views exist where the model was trained with train.validation",
-        ));
-    }
     let background = model.background_on(scene.background);
     let mut player = Player::new(model, registry, device)?.on(scene.background);
     let mut images = Vec::with_capacity(views.len());

@@ -135,7 +135,7 @@ pub struct BenchFrame {
     #[arg(long, value_name = "NAME")]
     pub case: Vec<String>,
     /// In place of the cases: one synthetic scene with 10 thousand to 5 million Gaussians, then with images of 0.1 to 8 megapixels.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "case")]
     pub growth: bool,
     /// Frames measured per case, after warming up.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
@@ -179,8 +179,8 @@ pub struct BenchStep {
     /// In place of the standard cases, a synthetic scene as large as published ones (n3dv, technicolor); may be given again.
     #[arg(long, value_name = "NAME")]
     pub case: Vec<String>,
-    /// Share of the pixels and Gaussians of synthetic scenes to keep.
-    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive)]
+    /// Share of the pixels and Gaussians of synthetic scenes to keep; with --case only.
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive, requires = "case")]
     pub scale: f64,
     /// Steps measured per case, after warming up.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
@@ -207,4 +207,21 @@ pub struct BenchLookup {
     /// Root of the seed tree.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::args::Cli;
+    use clap::Parser;
+
+    #[test]
+    fn options_without_effect_are_refused() {
+        let accepted = |line: &str| Cli::try_parse_from(line.split(' ')).map(drop).map_err(|e| e.to_string());
+        for line in ["cc4dgs bench frame --case n3dv --scale 0.5", "cc4dgs bench frame --growth --scale 0.5", "cc4dgs bench step --case n3dv --scale 0.5"] {
+            assert_eq!(accepted(line), Ok(()));
+        }
+        for line in ["cc4dgs bench frame --case n3dv --growth", "cc4dgs bench step --scale 0.5"] {
+            assert!(accepted(line).unwrap_err().contains("--case"), "{line}");
+        }
+    }
 }

@@ -39,7 +39,8 @@ pub struct Render {
     pub overwrite: bool,
     #[command(flatten)]
     pub shots: Shots,
-    /// Scene options over those the model was trained with, such as scene.width=800; with --scene only; may be given several times.
+    /// Scene options over those the model was trained with, such as scene.width=800 (larger than the dataset's images: --size); with --scene only; may be given
+    /// several times.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "scene")]
     pub sets: Vec<String>,
     /// Also make a video of the frames with the ffmpeg command.

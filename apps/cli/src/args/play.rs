@@ -32,7 +32,7 @@ pub struct Bake {
     /// Weight codec of the deformer, where MODEL is no archive yet [default: fp16].
     #[arg(long, value_name = "NAME")]
     pub field_weights: Option<String>,
-    /// Leave the deformer's weights out. The archive is smaller and moves by its layer; it cannot be compressed again.
+    /// Leave the deformer's weights out. The archive is smaller and moves by its layer; it can be neither compressed again nor pruned.
     #[arg(long)]
     pub without_field: bool,
     /// Frames per second of the recording; 30 where nobody says.

@@ -11,7 +11,7 @@ pub struct Prune {
     /// The dataset that the model was trained on.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Largest loss of PSNR in dB, on validation views where the model was trained with some (train.validation), else on training views.
+    /// Largest loss of PSNR in dB, on validation views where there are some (those of the dataset, or of train.validation), else on training views.
     #[arg(long, value_name = "DB", default_value = "0.1dB", value_parser = parse_decibels)]
     pub max_drop: f64,
     /// Iterations of training after each round of removal; 0 removes without training.

@@ -81,8 +81,9 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
     let subject = Subject::open(context, &args.views.model, &loaded, &args.views.scene, &args.views.sets)?;
-    images.renders.as_ref().map_or(Ok(()), |folder| image_folder::begin(folder, &earlier))?;
     let scored = Scored { split, max_views: args.max_views, perceptual: args.perceptual };
+    scored.check(&subject.scene)?;
+    images.renders.as_ref().map_or(Ok(()), |folder| image_folder::begin(folder, &earlier))?;
     let report = measure(context, &subject, scored, &images, &events)?;
     context.output.result(&report, || text(&report))?;
     report.sheet_error.map_or(Ok(()), Err)

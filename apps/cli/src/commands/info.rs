@@ -143,7 +143,11 @@ fn gaussians(host: &HostGaussians) -> Result<Value> {
 }
 
 fn scene(context: &Context, path: &Path) -> Result<Value> {
-    let scene = data::open(path, &SceneOptions::default(), &context.registry, &context.limits)?;
+    facts(path, &data::open(path, &SceneOptions::default(), &context.registry, &context.limits)?)
+}
+
+/// What is shown of `scene`, which was opened at `path`.
+fn facts(path: &Path, scene: &Scene) -> Result<Value> {
     let sizes: std::collections::BTreeSet<(u32, u32)> = scene.cameras.iter().map(|c| (c.width, c.height)).collect();
     let sizes: Vec<String> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
     Ok(json!({
@@ -151,9 +155,10 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
         "path": path.to_string_lossy(),
         "name": scene.name,
         "cameras": scene.cameras.len(),
-        CAMERAS: cameras(&scene),
+        CAMERAS: cameras(scene),
         "frames": scene.frame_count,
         "train_views": scene.split(Split::Train).len(),
+        "validation_views": scene.split(Split::Validation).len(),
         "test_views": scene.split(Split::Test).len(),
         "image_sizes": sizes,
         "camera_extent": plain(&scene.extent())?,
@@ -230,14 +235,20 @@ mod tests {
     #[test]
     fn cameras_are_listed_with_their_views() {
         let camera = |k: usize| Camera::look_at(&format!("cam{k:02}"), (8 + k as u32, 6), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
-        let split = |camera: usize| if camera == 0 { Split::Test } else { Split::Train };
+        let split = |camera: usize| match camera {
+            0 => Split::Test,
+            1 => Split::Validation,
+            _ => Split::Train,
+        };
         let views = (0..30).map(|i| View { camera: i % 15, frame: i / 15, time_norm: 0.0, split: split(i % 15) }).collect();
         let scene = Scene::new("s", (0..15).map(camera).collect(), views, Arc::new(NoImages), 0).unwrap();
         let all = Value::from(cameras(&scene));
         assert_eq!(all.as_array().unwrap().len(), 15);
         let lines = camera_lines(&all);
         assert_eq!((lines.len(), lines[0].as_str()), (MOST_CAMERAS + 1, "camera cam00: 8x6, 0 training, 0 validation and 2 test views"));
-        assert_eq!(lines[1], "camera cam01: 9x6, 2 training, 0 validation and 0 test views");
+        assert_eq!(lines[1], "camera cam01: 9x6, 0 training, 2 validation and 0 test views");
         assert_eq!(lines[MOST_CAMERAS], "and 3 more cameras, which --json lists");
+        let facts = facts(Path::new("s"), &scene).unwrap();
+        assert_eq!(["train_views", "validation_views", "test_views"].map(|key| facts[key].as_u64()), [Some(26), Some(2), Some(2)]);
     }
 }

@@ -32,6 +32,7 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     let events = context.listeners(None)?;
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    loaded.model.check_storable()?;
     say_what_is_lost(context, &args.model, &events)?;
     let scene = open_as_trained(&args.scene, &loaded.model, &args.sets, &context.registry, &context.limits)?;
     // A PLY says nothing of what is behind it.

@@ -231,6 +231,12 @@ fn archives_without_their_deformer_move_by_their_layer() {
     let (still, moved) = (export("still.ply", &[]), export("half.ply", &["--time", "0.5"]));
     let (moves, stays, half) = (judge.psnr(still.clone(), Some(0.5)), judge.psnr(still, None), judge.psnr(moved, Some(0.5)));
     assert!(stays > 40.0 && half > 40.0 && moves < half - 3.0, "{stays} dB canonical, {half} dB at half time, {moves} dB without motion");
-    let message = fail(&["compress", text(&bare), "--codec", "raw", "--out", text(&at("again.cc4d")), "-q"], 2);
-    assert!(message.contains("--without-field"), "{message}");
+    for again in [&["compress", text(&bare), "--codec", "raw"][..], &["prune", text(&bare), "--scene", "procedural:tiny"]] {
+        let message = fail(&[again, &["--out", text(&at("again.cc4d")), "-q"]].concat(), 2);
+        assert!(message.contains("--without-field"), "{message}");
+    }
+    let args = ["bench", "skip", text(&bare), "--scene", "procedural:tiny", "--device", "flex", "--frames", "1", "--rounds", "1", "-q", "--json"];
+    let skipped = json_of(&args);
+    let frames: Vec<&str> = skipped["frames"].as_array().unwrap().iter().filter_map(|row| row["off"].as_str()).collect();
+    assert!(frames.contains(&"static gating") && !frames.contains(&"vertex reuse"), "{skipped}");
 }

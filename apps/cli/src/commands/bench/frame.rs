@@ -188,7 +188,7 @@ fn time_case(context: &Context, name: String, model: &mut Model, camera: &Camera
         None => (Spread::of(Vec::new()), Spread::of(Vec::new())),
     };
     let mut player = Player::new(model, &context.registry, device)?;
-    let playback = time_playback(&mut player, args.frames as usize, |frame| (camera, frame as f32 / SEQUENCE as f32))?;
+    let playback = time_playback(&mut player, args.frames as usize, |frame| (camera, time_of(frame)))?;
     Ok(FrameCase {
         name,
         width: camera.width,
@@ -199,6 +199,11 @@ fn time_case(context: &Context, name: String, model: &mut Model, camera: &Camera
         field_spatial,
         field_forward_backward,
     })
+}
+
+/// The normalised time of a frame of playback, which begins again where the sequence ends: Gaussians may have faded at later times.
+fn time_of(frame: usize) -> f32 {
+    (frame % SEQUENCE) as f32 / SEQUENCE as f32
 }
 
 /// The spatial pass alone, and a pass forwards and backwards through the whole field.
@@ -258,4 +263,14 @@ fn text(report: &FrameReport) -> String {
         )
     }));
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn playback_stays_within_the_sequence() {
+        assert_eq!([0, 150, 300, 450, 10_000].map(time_of), [0.0, 0.5, 0.0, 0.5, 100.0 / 300.0]);
+    }
 }

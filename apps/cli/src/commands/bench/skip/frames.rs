@@ -158,7 +158,7 @@ impl FrameBench<'_> {
         let usual = Work { play: PlayShortcuts::default(), vertex_reuse: true, early_outs: [true; 2] };
         let mut cases = vec![Case::new("nothing", usual)];
         let mut all = usual;
-        for Switch { name, off, .. } in available("frames", self.switches(model, fixed)?, left_out) {
+        for Switch { name, off, .. } in available("frames", self.switches(model, fixed), left_out) {
             let mut work = usual;
             off(&mut work);
             off(&mut all);
@@ -196,16 +196,16 @@ impl FrameBench<'_> {
         let usual_ms = Spread::of(cases[0].later.frame.clone()).median_ms.max(1e-9);
         Ok(cases.into_iter().map(|case| case.row(usual_ms)).collect())
     }
-    fn switches(&self, model: &Model, fixed: Option<&str>) -> Result<Vec<FrameSwitch>> {
+    fn switches(&self, model: &Model, fixed: Option<&str>) -> Vec<FrameSwitch> {
         let no_deformer = model.field.is_none().then(|| "the model has no deformer".to_string());
         let no_vertices = match &model.field {
             None => no_deformer.clone(),
-            Some(field) if self.context.registry.deformer(field.name())?.info.capabilities.contains(&SHARES_VERTICES) => None,
+            Some(field) if self.shares_vertices(field.name()) => None,
             Some(field) => Some(format!("the deformer {} decodes no vertices", field.name())),
         };
         let fixed = fixed.map(str::to_string);
         let switch = |name, off: fn(&mut Work), missing: &Option<String>| Switch { name, off, missing: missing.clone() };
-        Ok(vec![
+        vec![
             switch("static gating", |w| w.play.static_gating = false, &no_deformer),
             switch("feature cache", |w| w.play.feature_cache = false, &no_deformer),
             // With a cache, vertices are decoded for the first frame alone.
@@ -213,7 +213,11 @@ impl FrameBench<'_> {
             switch("feature cache, vertex reuse", |w| (w.play.feature_cache, w.vertex_reuse) = (false, false), &no_vertices),
             switch("opacity early out", |w| w.early_outs[0] = false, &fixed),
             switch("transmittance early out", |w| w.early_outs[1] = false, &fixed),
-        ])
+        ]
+    }
+    /// Whether the deformer `name` decodes vertices that several Gaussians share. A playback layer in its place is no plug-in and has none.
+    fn shares_vertices(&self, name: &str) -> bool {
+        self.context.registry.deformer(name).is_ok_and(|plugin| plugin.info.capabilities.contains(&SHARES_VERTICES))
     }
     fn player<'m>(&self, model: &'m Model, case: &Case) -> Result<Player<'m>> {
         Ok(Player::with_shortcuts(model, &self.context.registry, self.device, case.work.play)?.on(self.background))
@@ -264,12 +268,11 @@ impl FrameBench<'_> {
             model.rasterizer.extend(EARLY_OUTS.iter().zip(work.early_outs).map(|(name, on)| (name.to_string(), on.into())));
         }
         let Some(deformer) = &mut model.field else { return Ok(()) };
-        let registry = &self.context.registry;
-        if !registry.deformer(deformer.name())?.info.capabilities.contains(&SHARES_VERTICES) {
+        if !self.shares_vertices(deformer.name()) {
             return Ok(());
         }
         deformer.section.insert(REUSE.into(), work.vertex_reuse.into());
-        let mut built = registry.build_deformer(&deformer.section, &deformer.context, self.device)?;
+        let mut built = self.context.registry.build_deformer(&deformer.section, &deformer.context, self.device)?;
         for (new, old) in built.parameters_mut().into_iter().zip(deformer.field.parameters()) {
             new.value = old.value.clone();
         }
