@@ -58,6 +58,11 @@ impl Forecast {
         let tried = (OCTAVES.start() * PER_OCTAVE..=OCTAVES.end() * PER_OCTAVE).rev().map(|k| f64::from(k) / f64::from(PER_OCTAVE));
         tried.into_iter().find(|octaves| loss(*octaves) <= allowed).unwrap_or(f64::NEG_INFINITY)
     }
+    /// The octaves with which `allowed` dB are lost where a round has just lost `loss` with `octaves` and training gains nothing more.
+    pub fn octaves_after(&self, octaves: f64, loss: f64, allowed: f64) -> f64 {
+        let cost = solve(self.precision, self.scaled)[0].max(self.least);
+        0.5 * libm::log2((libm::exp2(2.0 * octaves) + (allowed - loss) / cost).max(f64::MIN_POSITIVE))
+    }
     /// What a, b and g are multiplied with.
     fn row(&self, round: usize, octaves: f64) -> [f64; 3] {
         [libm::exp2(2.0 * octaves), -1.0, -(round as f64)]
@@ -108,6 +113,15 @@ mod tests {
         hopeless.add(1, 0.0, 5.0);
         hopeless.add(2, 0.0, 5.0);
         assert_eq!(hopeless.octaves(2, 0.01, 0.0), f64::NEG_INFINITY);
+    }
+
+    #[test]
+    fn a_round_that_missed_tells_the_next_steps() {
+        let forecast = Forecast::new(0.1, 100.0);
+        let cost = REMAINS * 0.1;
+        let [finer, coarser] = [0.05, 0.2].map(|allowed| forecast.octaves_after(1.0, 0.1, allowed));
+        assert!((cost * (4.0 - libm::exp2(2.0 * finer)) - 0.05).abs() < 1e-9 && (cost * (libm::exp2(2.0 * coarser) - 4.0) - 0.1).abs() < 1e-9);
+        assert!(forecast.octaves_after(1.0, 5.0, 0.0) < -10.0, "no steps are small enough");
     }
 
     #[test]

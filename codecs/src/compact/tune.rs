@@ -12,8 +12,9 @@ use super::settings::Settings;
 use super::{Attempt, Job, bytes_of};
 use cc4dgs_format::{CodecContext, Error, Event, HostGaussians, Result, Stream, TuneModel, TunedModel, Tuning, WeightArray};
 
-/// Rounds of training.
+/// Rounds of training, and how many follow at most while the last one has not kept what is allowed.
 const ROUNDS: usize = 5;
+const FURTHER: usize = 2;
 /// The most octaves by which the steps of the first round are larger than those that need no training, where a loss is allowed.
 const FIRST: f64 = 2.0;
 /// Octaves by which the steps of two rounds differ, at most.
@@ -21,8 +22,9 @@ const FARTHEST: f64 = 1.0;
 /// Standard deviations by which a round may lose more than expected: of all but the last, of the last if fine-tuning has a file that keeps what is allowed, and if it
 /// has none.
 const CAUTION: [f64; 3] = [0.5, 0.5, 1.0];
-/// The share of an allowed size that rounds aim at.
+/// The share of an allowed size that rounds aim at, and that of an allowed loss that those which follow the planned ones do.
 const SIZE_AIM: f64 = 0.99;
+const DROP_AIM: f64 = 0.8;
 /// Octaves by which steps of the deformer's weights grow to measure what they cost, and the least loss in dB that counts then: smaller ones are noise.
 const PROBED: f64 = 2.0;
 const LEAST_PROBED: f64 = 0.01;
@@ -131,7 +133,10 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         let per_octave = saved_by_doubling(job, &planner, quality, bytes_of(&untrained))?;
         let bits_per_octave = 8.0 * per_octave;
         let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
-        let (iterations, of) = (shares[round], (shares[..round].iter().sum(), settings.finetune));
+        // Those that follow are as long as the last.
+        let share = |round: usize| shares[round.min(count - 1)];
+        let (iterations, done) = (share(round), (0..round).map(share).sum::<usize>());
+        let of = (done, settings.finetune.max(done + iterations));
         let seed = context.seed.child("fine-tuning").index(round as u64);
         let mut model = tuner.tune(model, &Tuning { rounding, weight_steps, iterations, of, seed, size_weight: settings.size_weight, bits_per_octave })?;
         model.gaussians = canonical(&model.gaussians, &job.free);
@@ -151,13 +156,17 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
             Goal::Drop(_) => (drop, 0.0),
             Goal::Bytes(_) => {
                 let file = file_bytes(context, &streams, Some((&model.weights, weight_steps)))?;
-                (file, if number < count { saved_weights(tuner, &model.weights, weight_steps, weights)? } else { 0.0 })
+                (file, if number < count + FURTHER { saved_weights(tuner, &model.weights, weight_steps, weights)? } else { 0.0 })
             }
         };
         Ok((Outcome { streams, model, weight_steps, bytes, drop, used }, per_octave + saved))
     };
     let (mut best, mut nearest): (Option<Outcome>, Option<Outcome>) = (None, None);
-    for round in 0..count {
+    let mut missed = true;
+    for round in 0..count + FURTHER {
+        if round >= count && !missed {
+            break;
+        }
         let (outcome, per_octave) = match train(&model, round, octaves) {
             Err(e) if !matches!(e, Error::Interrupted(_)) => {
                 let message = format!("fine-tuning ended in round {} of {count}, and what was reached before is kept: {e}", round + 1);
@@ -168,22 +177,21 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         };
         model = outcome.model.clone();
         let (drop, used) = (outcome.drop, outcome.used);
+        missed = used > goal.limit();
         let (bytes, least) = best.as_ref().map_or(if allowed { (first_bytes, untuned) } else { (usize::MAX, f64::INFINITY) }, |b| (b.bytes, b.drop));
         if goal.is_better(&outcome, bytes, least) {
             best = Some(outcome);
         } else if nearest.as_ref().is_none_or(|n| used < n.used) {
             nearest = Some(outcome);
         }
-        if round + 1 < count {
-            let next = match goal {
-                Goal::Drop(limit) => {
-                    forecast.add(round + 1, octaves, drop);
-                    planned(&forecast, *limit, round + 1, best.is_some())
-                }
-                Goal::Bytes(limit) => octaves + (used - SIZE_AIM * limit) / per_octave,
-            };
-            octaves = next.clamp(octaves - FARTHEST, octaves + FARTHEST);
-        }
+        let next = match goal {
+            Goal::Drop(limit) => {
+                forecast.add(round + 1, octaves, drop);
+                if round + 1 < count { planned(&forecast, *limit, round + 1, best.is_some()) } else { forecast.octaves_after(octaves, drop, DROP_AIM * limit) }
+            }
+            Goal::Bytes(limit) => octaves + (used - SIZE_AIM * limit) / per_octave,
+        };
+        octaves = next.clamp(octaves - FARTHEST, octaves + FARTHEST);
     }
     let nearest = nearest.filter(|n| best.is_none() && !allowed && n.used < first_used);
     let told = |outcome: &Outcome| format!("{:.4} MB with the deformer's weights, PSNR {:.3} dB lower", megabytes(outcome.bytes), outcome.drop);

@@ -13,6 +13,8 @@ use std::collections::BTreeMap;
 struct Trainer {
     colors: Vec<f32>,
     cost: f64,
+    /// Share of that which training leaves.
+    remains: f64,
     gain: f64,
     /// Training fails after so many iterations.
     fails: Option<(f32, fn() -> Error)>,
@@ -25,7 +27,7 @@ impl Trainer {
     /// One by whose measure `attempt` loses so many dB before it trains.
     fn of(attempt: &Attempt, gaussians: &HostGaussians, lost: f64, gain: f64) -> Self {
         let colors = gaussians.sh_dc.clone();
-        let mut out = Self { colors, cost: 1.0, gain, fails: None, measured: RefCell::default(), adopted: Cell::new(0) };
+        let mut out = Self { colors, cost: 1.0, remains: 0.3, gain, fails: None, measured: RefCell::default(), adopted: Cell::new(0) };
         out.cost = lost / (40.0 - out.psnr(&attempt.rounded, &out.start(gaussians).unwrap().weights, None).unwrap());
         out
     }
@@ -51,7 +53,7 @@ impl TuneModel for Trainer {
         let rows = gaussians.dynamic_scores.iter().zip(gaussians.sh_dc.chunks_exact(3));
         let squares = rows.flat_map(|(&row, found)| found.iter().zip(&self.colors[3 * row as usize..])).map(|(a, b)| f64::from(a - b).powi(2));
         // Training makes up for most of what rounding costs.
-        let cost = self.cost * if weights[0].values[0] > 0.0 { 0.3 } else { 1.0 };
+        let cost = self.cost * if weights[0].values[0] > 0.0 { self.remains } else { 1.0 };
         let psnr = 40.0 - cost * squares.sum::<f64>() / self.colors.len() as f64 + self.gain * f64::from(weights[0].values[0]);
         self.measured.borrow_mut().insert(weights[0].values[0] as u32, psnr);
         Ok(psnr)
@@ -211,6 +213,23 @@ fn what_is_coded_is_quantised_once() {
         for settings in [plain, bounded] {
             assert!(search(job, &settings, context).unwrap() == streams, "{settings:?}");
             assert_eq!(QUANTISED.replace(0), passes, "{settings:?}");
+        }
+    });
+}
+
+#[test]
+fn a_round_follows_where_the_last_one_missed() {
+    with_job(0, |job, _, context, _| {
+        let attempt = job.attempt(0.01).unwrap();
+        let streams = job.streams(job.planner.gaussians, &attempt.plan).unwrap();
+        let found = Untuned { attempt: &attempt, streams: &streams, allowed: true };
+        // Training makes up for as much as is expected, and for less.
+        for (remains, rounds) in [(0.3, 5), (0.7, 6)] {
+            let trainer = Trainer { remains, ..Trainer::of(&attempt, job.planner.gaussians, 0.0499, 0.0) };
+            let tuned = tune(job, &found, &Goal::Drop(0.05), &Settings::default(), &trainer, context).unwrap();
+            assert!(matches!(tuned, Tuned::Better(better) if bytes_of(&better) < bytes_of(&streams)));
+            let lost: Vec<f64> = trainer.measured.borrow().values().map(|psnr| 40.0 - psnr).collect();
+            assert!(lost.len() == rounds + 1 && lost[rounds] <= 0.05 && (rounds == 5 || lost[5] > 0.05), "{lost:?}");
         }
     });
 }

@@ -22,8 +22,6 @@ const ROUNDS: usize = 12;
 /// Largest learning rates as shares of those in the middle of a main stage: of the Gaussians, and of the deformer's weights.
 const GAUSSIAN_RATE: f64 = 0.5;
 const DEFORMER_RATE: f64 = 0.3;
-/// How often these are halved, at most, because a re-fit with nothing removed loses: a model whose training ended with small steps is disturbed by large ones.
-const HALVINGS: usize = 2;
 
 /// Removes Gaussians of `job.model` in rounds, each followed by `iterations` of training, as long as the PSNR stays within `max_drop_db` of what it was, on
 /// validation views where the scene has some, else on training views. Returns the Gaussians and weights of the last round that did, and what it came to; what
@@ -40,27 +38,17 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
     let seed = Seed::root(model.provenance.seed).child("refit");
     // By the colours that the model has before anything is removed.
     let targets = job.tuner(model, scene).targets()?.clone();
-    let (psnr_before_db, psnr_refit_alone_db, rate) = {
+    let (psnr_before_db, psnr_refit_alone_db) = {
         let tuner = job.tuner(model, scene).with_targets(targets.clone());
         let start = tuner.start(&model.gaussians)?;
-        let psnr_before_db = tuner.psnr(&start.gaussians, &start.weights, None)?;
-        let (mut best, mut rate) = (None, 1.0);
-        for halvings in 0..=HALVINGS {
-            if before == 0 || best.is_some_and(|psnr| psnr >= psnr_before_db) {
-                break;
-            }
-            let tried = 0.5f64.powi(halvings as i32);
-            let found = refit(&tuner, &model.gaussians, iterations, tried, seed.child("alone"))?;
-            let psnr = tuner.psnr(&found.gaussians, &found.weights, None)?;
-            let message = format!("{before} Gaussians, {psnr_before_db:.3} dB; {psnr:.3} dB after re-fit with nothing removed, learning rates times {tried}");
-            job.events.emit(&Event::Note { object: "prune".into(), message });
-            if best.is_none_or(|other| psnr > other) {
-                best = Some(psnr);
-                rate = tried;
-            }
-        }
-        (psnr_before_db, best, rate)
+        let alone = (before > 0).then(|| refit(&tuner, &model.gaussians, iterations, seed.child("alone"))).transpose()?;
+        let alone = alone.map(|found| tuner.psnr(&found.gaussians, &found.weights, None)).transpose()?;
+        (tuner.psnr(&start.gaussians, &start.weights, None)?, alone)
     };
+    if let Some(alone) = psnr_refit_alone_db {
+        let message = format!("{before} Gaussians, {psnr_before_db:.3} dB; {alone:.3} dB after re-fit with nothing removed");
+        job.events.emit(&Event::Note { object: "prune".into(), message });
+    }
     let (mut share, mut psnr_after_db, mut last_order) = (FIRST_SHARE, psnr_before_db, None);
     for round in 0..ROUNDS {
         let n = model.gaussians.len();
@@ -75,7 +63,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         };
         let rest = at_rows(&model.gaussians, &order[..n - removed]);
         let tuner = job.tuner(model, scene).with_targets(targets.clone());
-        let trained = refit(&tuner, &rest, iterations, rate, seed.index(round as u64));
+        let trained = refit(&tuner, &rest, iterations, seed.index(round as u64));
         let trained = trained.and_then(|found| Ok((tuner.psnr(&found.gaussians, &found.weights, None)?, found)));
         drop(tuner);
         let (psnr, found) = match trained {
@@ -126,8 +114,8 @@ impl<'a> RefitJob<'a> {
     }
 }
 
-/// Trains `gaussians` and the weights of the tuner's model for `iterations`, at rates that rise to `rate` times the usual ones and fall.
-fn refit(tuner: &Tuner<'_>, gaussians: &HostGaussians, iterations: usize, rate: f64, seed: Seed) -> Result<TunedModel> {
+/// Trains `gaussians` and the weights of the tuner's model for `iterations`, at rates that rise and fall.
+fn refit(tuner: &Tuner<'_>, gaussians: &HostGaussians, iterations: usize, seed: Seed) -> Result<TunedModel> {
     let from = tuner.start(gaussians)?;
     let (scene, events, stop) = (&tuner.job.scene, tuner.job.events, tuner.job.stop);
     tuner.with_state(&from, seed, |context, state: &mut TrainState| {
@@ -140,7 +128,7 @@ fn refit(tuner: &Tuner<'_>, gaussians: &HostGaussians, iterations: usize, rate: 
             if stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted("in re-fitting; nothing was written".into()));
             }
-            let share = rate * rate_at((iteration as f64 - 0.5) / iterations as f64);
+            let share = rate_at((iteration as f64 - 0.5) / iterations as f64);
             let of_gaussians = names.iter().map(|name| (name.clone(), GAUSSIAN_RATE * share));
             state.rates = RateFactors(of_gaussians.chain([("deformer".into(), DEFORMER_RATE * share)]).collect());
             let check = iteration.is_multiple_of(CHECK_EVERY);
