@@ -31,7 +31,8 @@ const PROBES: usize = 8;
 /// Views per iteration. With one, training loses more than rounding.
 const BATCH: usize = 4;
 /// Largest learning rate in quantisation steps, of Gaussians and of weights whose codec states its steps, of a training of so many iterations: larger ones make
-/// values noisy, which costs bytes. Shorter trainings have larger ones, so that a random walk goes as far.
+/// values noisy, which costs bytes; half of it does not make up for the other steps of each round. Shorter trainings have larger ones, so that a random walk goes as
+/// far.
 const RATE: f64 = 0.02;
 const RATE_ITERATIONS: f64 = 200.0;
 /// Largest learning rate of weights without steps as a share of that in the middle of a main stage; ten times as much costs 0.4 dB.
