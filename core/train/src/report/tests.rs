@@ -1,5 +1,5 @@
 use super::*;
-use crate::sweep::{CellResult, DataFingerprint, ImageResult, Outcome, PlannedCell, PlannedTraining, ScoredViews, Spread};
+use crate::sweep::{CellResult, ImageResult, Outcome, PlannedCell, Spread, example_plan};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -303,29 +303,9 @@ fn names_of_missing_cells_cannot_leave_their_place() {
     write(folder.path(), &[]);
     result.write(&folder.path().join("results").join(format!("{}.json", ids[0]))).unwrap();
     let planned = |id: &str| PlannedCell { id: id.into(), training: training.into(), codec: format!("c{id}"), choice: result.provenance.codec.clone() };
-    let plan = Plan {
-        kind: "cc4dgs-sweep".into(),
-        schema: 1,
-        name: "g".into(),
-        version: String::new(),
-        commit: String::new(),
-        split: ScoredViews::Test,
-        max_views: 0,
-        images: 0,
-        trainings: vec![PlannedTraining {
-            id: training.into(),
-            scene: "a\n\\input{x}<q>".into(),
-            method: "m".into(),
-            setting: "base".into(),
-            seed: 0,
-            preset: "demo".into(),
-            sets: Vec::new(),
-            minutes: None,
-            data: DataFingerprint { path: "procedural:tiny".into(), hash: "0".into(), files: 0, bytes: 0 },
-            listing: String::new(),
-        }],
-        cells: ids.map(planned).to_vec(),
-    };
+    let mut plan = example_plan();
+    (plan.trainings[0].id, plan.trainings[0].scene) = (training.into(), "a\n\\input{x}<q>".into());
+    plan.cells = ids.map(planned).to_vec();
     plan.write(folder.path()).unwrap();
     let made = report(folder.path(), &ReportOptions { images: ImageChoice::None, ..Default::default() }).unwrap();
     assert!(made.gap.unwrap().contains("\\input{x}") && made.latex.contains("\n% 1 of 2 cells"), "{}", made.latex);

@@ -30,6 +30,8 @@ pub use folder::{Failure, SweepFolder};
 pub use grid::{Axis, CodecAxis, Grid, MethodAxis, MethodKeys, SceneAxis, SceneKeys, ScoredViews, SettingAxis, SettingKeys};
 pub use lock::TrainingLock;
 pub(crate) use mixture::notes as mixture_notes;
+#[cfg(test)]
+pub(crate) use plan::tests::example as example_plan;
 pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
 pub use read::{RESULTS, check_comparable, read_results};
 pub use result::{

@@ -127,7 +127,7 @@ fn a_plan_replaces_plans_only_and_lies_in_no_dataset() {
 }
 
 /// A plan of one training with two cells.
-pub(in crate::sweep) fn example() -> Plan {
+pub(crate) fn example() -> Plan {
     let (version, commit) = code::version();
     let choice = CodecChoice { codec: "raw".into(), field_weights: "fp32".into(), settings: toml::Table::new() };
     let cell = |id: &str, codec: &str| PlannedCell { id: id.into(), training: "00000000000000a0".into(), codec: codec.into(), choice: choice.clone() };
