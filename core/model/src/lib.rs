@@ -53,7 +53,7 @@ pub use life::{LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, gate_value};
 pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};
 pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;
-pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, state_array};
+pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, path_holds, state_array};
 pub use preset::{PresetPlugin, PresetRole};
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, SplatColors, Splats};
 pub use reader::{

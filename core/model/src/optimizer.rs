@@ -37,14 +37,14 @@ pub trait Optimizer: Send {
     /// The values after one step. `value` and `gradient` are `[N,W]`, plain tensors; a new array starts with zero state. Where values are rounded, in fine-tuning,
     /// `value` is 0 and the step is added to the values by the caller, in units of their quantisation steps: what depends on the size of values has no effect there.
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
-    /// Removes the state of all arrays whose names begin with `prefix`.
-    fn restart(&mut self, prefix: &str);
-    /// Reorders the state of the arrays whose names begin with `prefix`: row i is a copy of the old row `parents[i]`. Where `fresh[i]` is set, it starts without
-    /// momentum, but its steps have the size of its parent's.
+    /// Removes the state of all arrays that `path` holds ([`path_holds`]).
+    fn restart(&mut self, path: &str);
+    /// Reorders the state of the arrays that `path` holds ([`path_holds`]): row i is a copy of the old row `parents[i]`. Where `fresh[i]` is set, it starts
+    /// without momentum, but its steps have the size of its parent's.
     ///
     /// # Errors
     /// [`Error::Backend`] for rows that do not exist.
-    fn select_rows(&mut self, prefix: &str, parents: &[usize], fresh: &[bool]) -> Result<()>;
+    fn select_rows(&mut self, path: &str, parents: &[usize], fresh: &[bool]) -> Result<()>;
     /// The state for checkpoints.
     fn state(&self) -> OptimizerState;
     /// Restores what [`Optimizer::state`] returned. It is untrusted: an error, never a panic.
@@ -60,6 +60,13 @@ pub struct OptimizerPlugin {
 }
 cc4dgs_format::plugin_kind!(OptimizerPlugin, "optimizer");
 
+/// Whether `path` holds the array `name`: it is the name, or the beginning of it up to a slash. `gaussians/` holds `gaussians/life`, which does not hold
+/// `gaussians/life_gate`. The empty path holds all arrays.
+pub fn path_holds(path: &str, name: &str) -> bool {
+    let path = path.strip_suffix('/').unwrap_or(path);
+    path.is_empty() || name.strip_prefix(path).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+}
+
 /// Removes and returns the state array `name`.
 ///
 /// # Errors
@@ -69,4 +76,17 @@ pub fn state_array(state: &mut OptimizerState, name: &str) -> Result<Tensor<2>> 
         .arrays
         .remove(name)
         .ok_or_else(|| Error::data(format!("optimizer state '{name}'"), "it is missing", "The checkpoint is damaged or of another optimizer"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_ends_at_a_slash() {
+        let held = |path: &str| ["gaussians/life", "gaussians/life_gate", "deformer/net"].map(|name| path_holds(path, name));
+        assert_eq!(held("gaussians/life"), [true, false, false]);
+        assert_eq!((held("gaussians/"), held("gaussians")), ([true, true, false], [true, true, false]));
+        assert_eq!((held(""), held("gauss")), ([true; 3], [false; 3]));
+    }
 }

@@ -148,7 +148,8 @@ impl Default for TrainConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GaussianRates {
-    /// Every rate, those of plug-ins included, is multiplied by the views per iteration to this power: 0 leaves them as they are, 0.5 takes the root.
+    /// Every rate of the coarse and the main stage, those of plug-ins included, is multiplied by the number of views of the iteration to this power: 0 leaves
+    /// them as they are, 0.5 takes the root. Where there are fewer views than `batch` says, these count.
     pub batch_power: f64,
     /// Share of the main stage, at its end, over which every rate falls to 0 as a cosine; 0 is off.
     pub cooldown: f64,
@@ -264,7 +265,7 @@ impl TrainConfig {
             return bad(
                 "lr.batch_power",
                 format!("{} is not in 0..1", t.lr.batch_power),
-                "0 leaves learning rates as they are, 0.5 takes the root of the batch",
+                "0 leaves learning rates as they are, 0.5 takes the root of the number of views",
             );
         }
         if !(0.0..=1.0).contains(&t.lr.cooldown) {
@@ -284,13 +285,15 @@ impl TrainConfig {
         }
         Ok(())
     }
-    /// Views per iteration of `stage`.
+    /// Views per iteration of `stage`, where there are so many.
     pub fn views_per_iteration(&self, stage: Stage) -> usize {
         if stage == Stage::Coarse && self.coarse_batch > 0 { self.coarse_batch } else { self.batch }
     }
-    /// What every learning rate of an iteration is multiplied by.
-    pub fn rate_scale(&self, schedule: &Schedule) -> f64 {
-        let of_batch = (self.views_per_iteration(schedule.stage) as f64).powf(self.lr.batch_power);
+    /// What every learning rate of an iteration is multiplied by, whose loss is the mean over so many `views`. Where a trained model is trained further, rates
+    /// are shares of those of its training, and the views per iteration of that count.
+    pub fn rate_scale(&self, schedule: &Schedule, views: usize) -> f64 {
+        let views = if schedule.trained { self.views_per_iteration(schedule.stage) } else { views };
+        let of_batch = (views as f64).powf(self.lr.batch_power);
         let begin = 1.0 - self.lr.cooldown;
         if schedule.stage != Stage::Main || schedule.progress() <= begin {
             return of_batch;
@@ -306,11 +309,18 @@ mod tests {
     #[test]
     fn rates_fall_at_the_end_of_the_main_stage_alone() {
         let train = TrainConfig { batch: 4, lr: GaussianRates { batch_power: 0.5, cooldown: 0.25, ..Default::default() }, ..Default::default() };
-        let at = |stage: Stage, iteration: usize| train.rate_scale(&Schedule { stage, iteration, ..Schedule::main(1000) });
+        let at = |stage: Stage, iteration: usize| train.rate_scale(&Schedule { stage, iteration, ..Schedule::main(1000) }, 4);
         assert_eq!([1, 500, 750].map(|iteration| at(Stage::Main, iteration)), [2.0; 3]);
         assert!((at(Stage::Main, 875) - 1.0).abs() < 1e-9 && at(Stage::Main, 1000).abs() < 1e-9);
-        assert_eq!(at(Stage::Score, 1000), 2.0);
+        assert_eq!(at(Stage::Coarse, 1000), 2.0);
         let without = TrainConfig { lr: GaussianRates::default(), ..train.clone() };
-        assert_eq!(without.rate_scale(&Schedule { iteration: 1000, ..Schedule::main(1000) }), 1.0);
+        assert_eq!(without.rate_scale(&Schedule { iteration: 1000, ..Schedule::main(1000) }, 4), 1.0);
+    }
+
+    #[test]
+    fn rates_follow_the_views_of_an_iteration() {
+        let train = TrainConfig { batch: 9, lr: GaussianRates { batch_power: 0.5, ..Default::default() }, ..Default::default() };
+        assert_eq!([1, 4, 9].map(|views| train.rate_scale(&Schedule::main(1000), views)), [1.0, 2.0, 3.0]);
+        assert_eq!(train.rate_scale(&Schedule::further(1), 4), 3.0, "further training has shares of the rates of the training");
     }
 }

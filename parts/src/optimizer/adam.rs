@@ -2,7 +2,7 @@
 
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
-use cc4dgs_core::{Error, Optimizer, OptimizerPlugin, OptimizerState, Plugin, Result, StepSettings, config, inventory, state_array};
+use cc4dgs_core::{Error, Optimizer, OptimizerPlugin, OptimizerState, Plugin, Result, StepSettings, config, inventory, path_holds, state_array};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 
@@ -56,13 +56,13 @@ impl Optimizer for Adam {
         self.moments.insert(name.to_string(), Moments { first: stepped.m, second: stepped.v, steps });
         Ok(stepped.param)
     }
-    fn restart(&mut self, prefix: &str) {
-        self.moments.retain(|name, _| !name.starts_with(prefix));
+    fn restart(&mut self, path: &str) {
+        self.moments.retain(|name, _| !path_holds(path, name));
     }
-    fn select_rows(&mut self, prefix: &str, parents: &[usize], fresh: &[bool]) -> Result<()> {
+    fn select_rows(&mut self, path: &str, parents: &[usize], fresh: &[bool]) -> Result<()> {
         let count = parents.len();
         let rows: Vec<i64> = parents.iter().map(|&row| row as i64).collect();
-        for (name, moments) in self.moments.iter_mut().filter(|(name, _)| name.starts_with(prefix)) {
+        for (name, moments) in self.moments.iter_mut().filter(|(name, _)| path_holds(path, name)) {
             let [have, _] = moments.first.dims();
             if fresh.len() != count || parents.iter().any(|&row| row >= have) {
                 return Err(Error::backend(format!("optimizer adam: {name}"), format!("{count} rows are selected of {have}"), "Report this as a defect"));

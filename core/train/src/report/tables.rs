@@ -37,8 +37,9 @@ pub struct Table {
     pub notes: Vec<String>,
 }
 
-/// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds, the best mean of a column marked.
-/// Times of trainings that ran on different devices state these, and none is the best.
+/// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds. The best mean of a column is marked
+/// where there are several of trainings that did not fail; those that did are never the best. Times of trainings that ran on different devices state these, and
+/// none is the best.
 pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], trained: &TrainingDevices) -> Table {
     let settings = rows.iter().any(|row| row.setting != "base");
     let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
@@ -70,15 +71,16 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
         };
         head.push(format!("{}{arrow}", quantity.title()));
         let rounded = |mean: f64| format!("{mean:.*}", quantity.digits);
-        let best = best(quantity, spreads.iter().flatten().map(|s| s.mean)).map(rounded);
         let mixed = quantity.key == TRAINING.key && trained.differ();
+        let means: Vec<f64> = spreads.iter().zip(rows).filter(|(_, row)| !row.hopeless()).filter_map(|(spread, _)| spread.map(|s| s.mean)).collect();
+        let best = if means.len() > 1 && !mixed { best(quantity, means.into_iter()).map(rounded) } else { None };
         if mixed {
             notes.push(trained.sentence());
         }
         for ((line, spread), row) in lines.iter_mut().zip(&spreads).zip(rows) {
             let mark = if mixed { trained.mark(&row.cells) } else { String::new() };
             let text = spread.map_or_else(|| "–".to_string(), |s| s.text(quantity.digits) + &mark);
-            let is_best = rows.len() > 1 && !mixed && spread.is_some_and(|s| Some(rounded(s.mean)) == best);
+            let is_best = !row.hopeless() && spread.is_some_and(|s| Some(rounded(s.mean)) == best);
             line.push(Cell { text, best: is_best });
         }
     }

@@ -125,6 +125,27 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
 }
 
 #[test]
+fn the_best_of_a_column_is_one_of_several_that_did_not_fail() {
+    let folder = tempfile::tempdir().unwrap();
+    let cells = sweep(folder.path());
+    let options = ReportOptions { columns: vec!["psnr_db".into()], images: ImageChoice::None, ..Default::default() };
+    // Rows with a value in bold, after a change of the cells with these indices: two seeds for each of cdf, then of hexplane, with cca-default and cca-low.
+    let bold = |changed: &[usize], change: &dyn Fn(&mut CellResult)| {
+        let mut cells = cells.clone();
+        changed.iter().for_each(|&i| change(&mut cells[i]));
+        write(folder.path(), &cells);
+        let markdown = report(folder.path(), &options).unwrap().markdown;
+        markdown.lines().filter(|line| line.starts_with('|') && line.contains("**")).map(String::from).collect::<Vec<_>>()
+    };
+    let failed = |cell: &mut CellResult| cell.outcome = Outcome::Hopeless;
+    assert_eq!(bold(&[], &failed), ["| hexplane | cca-default | 2 | **31.10 ± 0.14** |"]);
+    assert_eq!(bold(&[4, 6], &failed), ["| cdf | cca-default | 2 | **30.10 ± 0.14** |"], "one seed is enough");
+    assert!(bold(&[2, 4, 6], &failed).is_empty(), "only one is left to be the best");
+    let unscored = |cell: &mut CellResult| _ = cell.metrics.remove("psnr_db");
+    assert!(bold(&[0, 2, 6], &unscored).is_empty(), "only one has a mean");
+}
+
+#[test]
 fn scores_of_validation_views_are_drawn_where_there_are_some() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());

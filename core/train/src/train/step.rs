@@ -225,7 +225,7 @@ impl Context<'_> {
         let extent = f64::from(schedule.extent);
         let of_plugin: BTreeMap<String, f64> =
             state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
-        let scale = train.rate_scale(schedule);
+        let scale = train.rate_scale(schedule, batch.len());
         let rates = state.rates.clone();
         let rate = |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, schedule));
         match state.rounded.take() {
