@@ -127,4 +127,8 @@ pub struct SweepEmit {
     /// Bucket (skypilot).
     #[arg(long, value_name = "URL", default_value = "s3://cc4dgs")]
     pub bucket: String,
+    /// Environment variable of the jobs; may be given several times. k8s and skypilot need those that paths of scenes start from, such as CC4DGS_DATA; slurm takes
+    /// their values here where they are not given.
+    #[arg(long = "env", value_name = "NAME=VALUE")]
+    pub variables: Vec<String>,
 }

@@ -1,12 +1,16 @@
 //! The trainings of a plan as jobs of schedulers. Each index runs `cc4dgs sweep run DIR --plan ID --index I`: the training and the cells it lacks.
 
+use super::location::variable_of;
 use super::plan::Plan;
 use cc4dgs_core::{Error, Result};
+use std::collections::BTreeMap;
 
 /// Exit code of a process that was asked to stop and left a checkpoint.
 pub const INTERRUPTED: u8 = 130;
 /// Exit codes after which the same command would fail again: wrong request, wrong data, hopeless training.
 const FINAL: [u8; 3] = [2, 3, 6];
+/// Variables that tell a job the index of its training.
+const INDEX_VARIABLES: [&str; 3] = ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "INDEX"];
 /// Seconds before a time limit at which a job is asked to stop.
 const NOTICE_SECONDS: u32 = 120;
 
@@ -34,6 +38,9 @@ pub struct EmitOptions {
     pub threads: usize,
     /// Limits of the machines that jobs run on, each `KEY=VALUE`; see [`super::Worker::limits`].
     pub limits: Vec<String>,
+    /// Environment variables of the jobs, each `NAME=VALUE`. Those that scenes of the plan start from are needed. Jobs of Slurm, which see the folders of this
+    /// machine, get its values of these where none are stated.
+    pub variables: Vec<String>,
     /// Memory of a job in GB (10^9 bytes).
     pub memory_gb: u32,
     /// Time limit of a job in minutes. A job that reaches it leaves a checkpoint and is run again: SkyPilot does so three times, the others as often as needed.
@@ -51,15 +58,18 @@ pub struct EmitOptions {
 /// The file for `scheduler`.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a plan without trainings, for texts that no quoting makes safe, and for a number of jobs that SkyPilot would not keep to.
+/// [`Error::Parameter`] for a plan without trainings, for texts that no quoting makes safe, for wrong or missing variables, and for a number of jobs that
+/// SkyPilot would not keep to.
 pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<String> {
     if plan.trainings.is_empty() {
         return Err(Error::parameter(format!("sweep {}", plan.name), "it has no training", "Make the plan again from a grid with at least one cell"));
     }
     let o = options;
+    let variables = variables(scheduler, plan, &o.variables)?;
     let texts =
         [("folder", &o.folder), ("--cd", &o.working_folder), ("--program", &o.program), ("--image", &o.image), ("--claim", &o.claim), ("--bucket", &o.bucket)];
-    for (option, text) in texts.into_iter().chain(o.limits.iter().map(|limit| ("--limit", limit))) {
+    let more = o.limits.iter().map(|limit| ("--limit", limit)).chain(variables.values().map(|value| ("--env", value)));
+    for (option, text) in texts.into_iter().chain(more) {
         if text.chars().any(char::is_control) {
             return Err(Error::parameter(option, "it has a line break or another control character", "Use another name"));
         }
@@ -76,10 +86,46 @@ pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<
         return Err(Error::parameter("--parallel", problem, "Leave it out, and launch the indices in parts"));
     }
     Ok(match scheduler {
-        Scheduler::Slurm => slurm(plan, o),
-        Scheduler::Kubernetes => kubernetes(plan, o),
-        Scheduler::SkyPilot => skypilot(plan, o),
+        Scheduler::Slurm => slurm(plan, o, &variables),
+        Scheduler::Kubernetes => kubernetes(plan, o, &variables),
+        Scheduler::SkyPilot => skypilot(plan, o, &variables),
     })
+}
+
+/// The environment variables of the jobs: those that are `stated`, and of Slurm's jobs those of this machine that scenes start from.
+fn variables(scheduler: Scheduler, plan: &Plan, stated: &[String]) -> Result<BTreeMap<String, String>> {
+    let mut found = BTreeMap::new();
+    for text in stated {
+        let object = format!("--env {text}");
+        let Some((name, value)) = text.split_once('=').filter(|(_, value)| !value.is_empty()) else {
+            return Err(Error::parameter(object, "it is not NAME=VALUE", "Write for instance --env CC4DGS_DATA=/data"));
+        };
+        if INDEX_VARIABLES.contains(&name) {
+            return Err(Error::parameter(object, "jobs read the index of their training from this variable", "Leave it out"));
+        }
+        if found.insert(name.to_string(), value.to_string()).is_some() {
+            return Err(Error::parameter(object, format!("{name} is given twice"), "Give it once"));
+        }
+    }
+    for path in plan.trainings.iter().map(|training| &training.data.path) {
+        let Some(name) = variable_of(path).filter(|name| !found.contains_key(*name)) else { continue };
+        let problem = match (scheduler, std::env::var(name)) {
+            (Scheduler::Slurm, Ok(value)) if !value.is_empty() => {
+                found.insert(name.to_string(), value);
+                continue;
+            }
+            (Scheduler::Slurm, _) => format!("the environment variable {name} is not set here, so jobs would not get it"),
+            _ => format!("jobs of Kubernetes and SkyPilot do not have the environment variable {name} of this machine"),
+        };
+        let remedy = format!("Give --env {name}=DIR, the folder that the path starts from as the jobs see it");
+        return Err(Error::parameter(format!("scene {path}"), problem, remedy));
+    }
+    let is_name = |name: &str| !name.starts_with(|c: char| c.is_ascii_digit()) && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
+    if let Some(name) = found.keys().find(|name| name.is_empty() || !is_name(name)) {
+        let problem = "names of variables have ASCII letters, digits and '_', and do not begin with a digit";
+        return Err(Error::parameter(format!("variable '{name}'"), problem, "Use another name"));
+    }
+    Ok(found)
 }
 
 /// `text` as one word of a shell.
@@ -114,7 +160,7 @@ fn job_name(plan: &Plan) -> String {
     format!("cc4dgs-{}", name.trim_matches('-'))
 }
 
-fn slurm(plan: &Plan, o: &EmitOptions) -> String {
+fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
     let last = plan.trainings.len() - 1;
     let throttle = if o.parallel > 0 { format!("%{}", o.parallel) } else { String::new() };
     let output = sbatch_quoted(&format!("{}/logs/slurm-%a.log", o.folder.replace('%', "%%")));
@@ -132,7 +178,7 @@ fn slurm(plan: &Plan, o: &EmitOptions) -> String {
 #SBATCH --signal=B:TERM@{NOTICE_SECONDS}
 #SBATCH --output={output}
 set -u
-cd {cd} || exit 2
+{variables}cd {cd} || exit 2
 {program} --quiet --threads {threads} {limits}sweep run {folder} --plan {plan} --index "$SLURM_ARRAY_TASK_ID" &
 work=$!
 trap 'kill -TERM "$work" 2>/dev/null' TERM INT
@@ -154,6 +200,7 @@ exit "$code"
         threads = o.threads,
         memory = u64::from(o.memory_gb) * 1_000_000_000 / (1 << 20),
         minutes = o.minutes,
+        variables = variables.iter().map(|(name, value)| format!("export {name}={}\n", quoted(value))).collect::<String>(),
         cd = quoted(&o.working_folder),
         program = quoted(&o.program),
         limits = limit_options(o),
@@ -162,8 +209,10 @@ exit "$code"
     )
 }
 
-fn kubernetes(plan: &Plan, o: &EmitOptions) -> String {
+fn kubernetes(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
     let parallel = if o.parallel > 0 { o.parallel } else { plan.trainings.len() };
+    // Kubernetes replaces $(NAME) in values, and $$ by $.
+    let variable = |(name, value): (&String, &String)| format!("        - name: {}\n          value: {}\n", yaml(name), yaml(&value.replace('$', "$$")));
     format!(
         r#"# {trainings} trainings, {cells} cells. Submit with: kubectl apply -f FILE. Interrupted and evicted pods, and pods at their time limit, are replaced
 # and go on from the checkpoint; codes after which the same command would fail again end their index only. Needs Kubernetes 1.33, or 1.29 with its defaults.
@@ -208,7 +257,7 @@ spec:
           valueFrom:
             fieldRef:
               fieldPath: metadata.annotations['batch.kubernetes.io/job-completion-index']
-        resources:
+{variables}        resources:
           requests:
             cpu: "{threads}"
             memory: {memory}M
@@ -231,6 +280,7 @@ spec:
         program = yaml(&o.program),
         limits = o.limits.iter().map(|limit| format!("\"--limit\", {}, ", yaml(limit))).collect::<String>(),
         folder = yaml(&o.folder),
+        variables = variables.iter().map(variable).collect::<String>(),
         threads = o.threads,
         memory = u64::from(o.memory_gb) * 1000,
         stop_after = stop_after(o.minutes),
@@ -239,7 +289,7 @@ spec:
     )
 }
 
-fn skypilot(plan: &Plan, o: &EmitOptions) -> String {
+fn skypilot(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
     let name = job_name(plan);
     let last = plan.trainings.len() - 1;
     // SkyPilot has no time limit. `timeout` asks the program to stop and ends with the program's own code.
@@ -262,7 +312,7 @@ resources:
     max_restarts_on_errors: 3
 envs:
   INDEX: null
-file_mounts:
+{variables}file_mounts:
   {cd}:
     source: {bucket}
     mode: MOUNT
@@ -280,6 +330,7 @@ run: |
         cells = plan.cells.len(),
         threads = o.threads,
         memory = o.memory_gb,
+        variables = variables.iter().map(|(name, value)| format!("  {}: {}\n", yaml(name), yaml(value))).collect::<String>(),
         cd = yaml(&o.working_folder),
         cd_shell = quoted(&o.working_folder),
         bucket = yaml(&o.bucket),

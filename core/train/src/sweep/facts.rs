@@ -1,6 +1,7 @@
 //! What a sweep runs on: datasets by content, devices by name.
 
 use super::hash::ContentHash;
+use super::location::locate;
 use super::result::{DataFingerprint, DeviceFacts, TrainingDevice};
 use crate::data::named_files;
 use cc4dgs_core::{Error, Registry, Result, adapters, resolved_device};
@@ -12,23 +13,6 @@ use xxhash_rust::xxh3::Xxh3;
 /// Deepest folder of a dataset, and most files and folders: a link that leads in a circle ends here.
 const MOST_DEPTH: usize = 32;
 const MOST_ENTRIES: usize = 5_000_000;
-
-/// The path a grid's text stands for: an environment variable at its start is replaced, as in `$CC4DGS_DATA/mutant`.
-///
-/// # Errors
-/// [`Error::Parameter`] for a variable that is not set.
-pub fn locate(text: &str) -> Result<PathBuf> {
-    let Some(rest) = text.strip_prefix('$') else { return Ok(PathBuf::from(text)) };
-    let (variable, tail) = rest.split_once('/').unwrap_or((rest, ""));
-    match std::env::var_os(variable) {
-        Some(value) if !value.is_empty() => Ok(if tail.is_empty() { PathBuf::from(value) } else { Path::new(&value).join(tail) }),
-        _ => Err(Error::parameter(
-            format!("path {text}"),
-            format!("the environment variable {variable} is not set"),
-            "Set it to the folder that the path starts from",
-        )),
-    }
-}
 
 /// A file of a dataset: name relative to the dataset, or the whole path where the dataset names it so, and bytes.
 struct DataFile {
@@ -388,8 +372,6 @@ mod tests {
         assert_eq!((tiny.files, tiny.path.as_str()), (0, "procedural:tiny"));
         assert_ne!(tiny.hash, fingerprint("procedural", &registry).unwrap().hash);
         assert!(fingerprint("no/such/folder", &registry).unwrap_err().to_string().contains("no such"));
-        let message = locate("$CC4DGS_NO_SUCH_VARIABLE/x").unwrap_err().to_string();
-        assert!(message.contains("CC4DGS_NO_SUCH_VARIABLE is not set"), "{message}");
         let facts = device_facts("flex");
         assert!(facts.name == "flex" && facts.adapter.is_none() && facts.threads > 0, "{facts:?}");
     }

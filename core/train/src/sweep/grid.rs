@@ -1,6 +1,6 @@
 //! A grid: scenes x methods x settings x codecs x seeds, as a TOML file. `docs/sweeps.md` describes the keys.
 
-use super::facts::locate;
+use super::location::locate;
 use super::overruled::refuse_overruled;
 use super::result::CodecChoice;
 use crate::auto::PRESET as AUTO;

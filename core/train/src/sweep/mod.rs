@@ -12,6 +12,7 @@ mod folder;
 mod grid;
 mod hash;
 mod lines;
+mod location;
 mod lock;
 mod mixture;
 mod overruled;

@@ -1,8 +1,9 @@
 //! From a grid to trainings and cells, each named by what it is made of.
 
-use super::facts::{fingerprint, listing, locate, would_be_part};
+use super::facts::{fingerprint, listing, would_be_part};
 use super::grid::{Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
 use super::hash::{ContentHash, name_of};
+use super::location::locate;
 use super::result::{CodecChoice, DataFingerprint};
 use crate::code;
 use crate::config::RunConfig;

@@ -1,7 +1,8 @@
 //! Runs a training of a sweep, or goes on with one that was interrupted.
 
-use super::facts::{PeakMemory, listing, locate, training_device};
+use super::facts::{PeakMemory, listing, training_device};
 use super::folder::SweepFolder;
+use super::location::locate;
 use super::plan::PlannedTraining;
 use super::result::{Curve, Outcome, TrainingDevice, ValidationCurve};
 use crate::auto;

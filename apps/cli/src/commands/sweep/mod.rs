@@ -189,6 +189,7 @@ pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
         program,
         threads: if threads == 0 { 1 } else { threads },
         limits: context.limit_options.to_vec(),
+        variables: args.variables.clone(),
         memory_gb: args.memory_gb,
         minutes: args.time_limit,
         parallel: args.parallel,

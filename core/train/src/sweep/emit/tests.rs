@@ -16,6 +16,7 @@ fn options() -> EmitOptions {
         program: "/opt/cc4dgs".into(),
         threads: 2,
         limits: Vec::new(),
+        variables: Vec::new(),
         memory_gb: 8,
         minutes: 60,
         parallel: 0,
@@ -195,7 +196,41 @@ fn limits_reach_the_program() {
     assert_eq!(arguments.as_array().unwrap()[3..8], ["--limit", "max_bytes=7", "--limit", "max_pixels=9", "sweep"].map(Value::from));
 }
 
-/// The script as bash reads it, with a program that answers with its arguments and an exit code.
+#[test]
+fn variables_reach_the_jobs() {
+    let emitted = |scheduler, path: &str, variables: &[&str]| {
+        let mut plan = plan();
+        plan.trainings[0].data.path = path.into();
+        emit(scheduler, &plan, &EmitOptions { variables: variables.iter().map(ToString::to_string).collect(), ..options() })
+    };
+    let job = |scheduler| emitted(scheduler, "$CC4DGS_DATA/mutant", &["CC4DGS_DATA=/it's $(HOME)", "no=1=2"]).unwrap();
+    let pod = parse(&job(Scheduler::Kubernetes));
+    let environment = &pod["spec"]["template"]["spec"]["containers"][0]["env"];
+    assert_eq!(environment.as_array().unwrap().len(), 3, "{environment}");
+    assert_eq!(environment[1], serde_json::json!({ "name": "CC4DGS_DATA", "value": "/it's $$(HOME)" }));
+    assert_eq!(environment[2], serde_json::json!({ "name": "no", "value": "1=2" }));
+    let task = parse(&job(Scheduler::SkyPilot));
+    assert_eq!(task["envs"], serde_json::json!({ "INDEX": null, "CC4DGS_DATA": "/it's $(HOME)", "no": "1=2" }));
+    let slurm = job(Scheduler::Slurm);
+    assert!(slurm.contains("\nexport CC4DGS_DATA='/it'\\''s $(HOME)'\nexport no='1=2'\ncd "), "{slurm}");
+
+    // Where scenes start from a variable, jobs have it or there is no file. Every system has PATH.
+    let refused = |scheduler, path: &str, variables: &[&str]| emitted(scheduler, path, variables).unwrap_err().to_string();
+    for scheduler in [Scheduler::Kubernetes, Scheduler::SkyPilot] {
+        let message = refused(scheduler, "$PATH/mutant", &["OTHER=1"]);
+        assert!(message.contains("scene $PATH/mutant") && message.contains("--env PATH=DIR"), "{message}");
+    }
+    let here = format!("\nexport PATH={}\n", quoted(&std::env::var("PATH").unwrap()));
+    assert!(emitted(Scheduler::Slurm, "$PATH/mutant", &[]).unwrap().contains(&here));
+    assert!(emitted(Scheduler::Slurm, "$PATH/mutant", &["PATH=/there"]).unwrap().contains("\nexport PATH='/there'\n"));
+    let message = refused(Scheduler::Slurm, "$CC4DGS_NO_SUCH_VARIABLE/mutant", &[]);
+    assert!(message.contains("CC4DGS_NO_SUCH_VARIABLE is not set here"), "{message}");
+    for wrong in [&["A"][..], &["A="], &["1A=x"], &["A B=x"], &["=x"], &["INDEX=3"], &["A=x", "A=y"], &["A=x\ny"]] {
+        assert!(emitted(Scheduler::SkyPilot, "procedural:tiny", wrong).is_err(), "{wrong:?}");
+    }
+}
+
+/// The script as bash reads it, with a program that answers with its arguments, a variable and an exit code.
 #[cfg(unix)]
 #[test]
 fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
@@ -210,8 +245,13 @@ fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
     program("scontrol", &format!("echo \"$@\" >> {}", at("requeued").display()));
     let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap_or_default());
     for (code, requeued) in [(0, ""), (6, ""), (i32::from(INTERRUPTED), "requeue 7_3\n")] {
-        program("it's the program", &format!("printf '%s\\n' \"$@\" > {}\nexit {code}", at("arguments").display()));
-        let options = EmitOptions { program: at("it's the program").display().to_string(), working_folder: folder.path().display().to_string(), ..options() };
+        program("it's the program", &format!("printf '%s\\n' \"$@\" \"$CC4DGS_DATA\" > {}\nexit {code}", at("arguments").display()));
+        let options = EmitOptions {
+            program: at("it's the program").display().to_string(),
+            working_folder: folder.path().display().to_string(),
+            variables: vec!["CC4DGS_DATA=/it's $HOME".into()],
+            ..options()
+        };
         std::fs::write(at("array.sh"), emit(Scheduler::Slurm, &plan(), &options).unwrap()).unwrap();
         assert!(Command::new("bash").arg("-n").arg(at("array.sh")).status().unwrap().success());
         let status =
@@ -220,7 +260,7 @@ fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
         let arguments = std::fs::read_to_string(at("arguments")).unwrap();
         assert_eq!(
             arguments.lines().collect::<Vec<_>>(),
-            ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--plan", &plan().id(), "--index", "3"]
+            ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--plan", &plan().id(), "--index", "3", "/it's $HOME"]
         );
         assert_eq!(std::fs::read_to_string(at("requeued")).unwrap_or_default(), requeued);
     }
