@@ -15,15 +15,17 @@ pub mod exact;
 mod memory;
 mod navigator;
 mod render;
+mod scene;
 #[cfg(target_arch = "wasm32")]
 mod web;
 #[cfg(all(feature = "window", not(target_arch = "wasm32")))]
 pub mod window;
 
 pub use clock::Clock;
-pub use content::{Content, Scene};
+pub use content::Content;
 pub use navigator::Navigator;
 pub use render::{Mode, Renderer, View, device_of, request_device};
+pub use scene::Scene;
 
 /// The codecs and fields that archives may need. Linkers drop what nobody refers to, above all on wasm32.
 pub fn link() {

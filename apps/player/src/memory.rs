@@ -1,7 +1,7 @@
 //! The memory that a model takes while it opens, estimated before it is decoded. Where WebAssembly runs out of memory in between, nothing of the module can be
 //! called any more, and the page would have to be loaded again.
 
-use crate::content::GAUSSIAN_FLOATS;
+use crate::scene::GAUSSIAN_FLOATS;
 use cc4dgs_format::archive::{Archive, StreamKind};
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::{Error, Result, spz};

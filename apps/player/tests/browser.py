@@ -7,7 +7,7 @@ the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
 from browser_faults import broken_module, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
-from browser_gaussian import one_gaussian
+from browser_gaussian import one_gaussian, remarks
 from browser_input import command_key, drop, embedded, focus, held, reduced_motion, touch, wheel
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
@@ -129,6 +129,7 @@ def main():
         no_room(pages)
         few_degrees(pages)
         one_gaussian(pages)
+        remarks(pages)
         opened_meanwhile(pages)
         second_player(pages)
         destroyed(pages, facts)

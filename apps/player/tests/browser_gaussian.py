@@ -1,5 +1,5 @@
 """Checks of browser.py: a model of one Gaussian."""
-import math
+import gzip, math, struct
 from browser_pages import say
 
 # Opens one Gaussian at the origin with these standard deviations along x, y and z.
@@ -7,6 +7,12 @@ OPEN = """async sigmas => { const names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity sc
     const head = `ply\\nformat binary_little_endian 1.0\\nelement vertex 1\\n${names.map(name => `property float ${name}\\n`).join("")}end_header\\n`;
     const values = new Float32Array([0, 0, 0, 1.77, 1.77, 1.77, 3, ...sigmas.map(v => Math.log(v)), 1, 0, 0, 0]);
     await cc4dgs.load(new File([head, values], "one.ply")); }"""
+# One Gaussian as an SPZ file of version 2, whose header says that vendor extensions follow: position, opacity, colour, scale and rotation.
+EXTENDED = gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 2, 1, 0, 12, 2, 0) + bytes(9) + bytes([255] + [200] * 3 + [120] * 3 + [128] * 3))
+# Opens these bytes; returns the warnings, and what the page says.
+WARNED = """async bytes => { const warned = []; cc4dgs.on("warning", e => warned.push(e.message));
+    await cc4dgs.load(new File([new Uint8Array(bytes)], "one.spz"));
+    const note = document.querySelector(".note"); return [warned, note.hidden ? "" : note.querySelector("p").textContent]; }"""
 BRIGHTEST = "cc4dgs.capture().then(({ data }) => data.reduce((most, v, i) => (i % 4 < 3 ? Math.max(most, v) : most), 0))"
 PIXEL = "async ([camera, x, y]) => { const { width, data } = await cc4dgs.capture(camera, 0); return data[4 * (y * width + x)]; }"
 # From (3, 0, 0) to the origin; columns are along y, rows along z.
@@ -32,3 +38,13 @@ def one_gaussian(pages):
         page.close()
     pages.quiet("one Gaussian")
     say("a single Gaussian is seen, and drawn whole")
+
+
+def remarks(pages):
+    """What the page does not read of a file is said, and told to those who listen."""
+    page = pages.open()
+    warned, said = page.evaluate(WARNED, list(EXTENDED))
+    assert len(warned) == 1 and warned[0].startswith("one.spz: vendor extensions are not read") and said == warned[0], (warned, said)
+    page.close()
+    pages.quiet("remarks")
+    say(f"what is not read of a file is said: {said}")

@@ -212,7 +212,7 @@ class Page {
     get problem() { return this.failure ?? this.first?.back ?? null; }
     /// Says what is not shown of the model.
     warn() {
-        const { lacksMotion, shDegree, storedDegree } = this.facts, lines = [];
+        const { lacksMotion, shDegree, storedDegree, remarks } = this.facts, lines = [...remarks];
         if (lacksMotion) lines.push("This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d");
         if (shDegree < storedDegree) lines.push(`Spherical harmonics are shown up to degree ${shDegree} of ${storedDegree}: more do not fit into a texture of WebGL2. Use a browser with WebGPU to see all.`);
         const message = lines.join(" ");

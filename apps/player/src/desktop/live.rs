@@ -118,7 +118,7 @@ mod tests {
     fn a_window_is_woken_by_what_is_offered_and_takes_it_once() {
         let (live, woken) = (Live::default(), Arc::new(Mutex::new(Vec::new())));
         let scene = Scene::new(&HostGaussians::default(), None).unwrap();
-        let content = Content { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, bytes: 0 };
+        let content = Content { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, remarks: Vec::new(), bytes: 0 };
         let noted = woken.clone();
         live.open(move |delay| noted.lock().unwrap().push(delay));
         assert!(live.is_open() && live.wants() && live.take().is_none());

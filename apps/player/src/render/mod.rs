@@ -6,7 +6,7 @@ mod target;
 mod uniforms;
 mod uploaded;
 
-use crate::content::Scene;
+use crate::scene::Scene;
 use cc4dgs_format::{Camera, Error, HostGaussians, Image8, Result};
 use pipelines::Pipelines;
 use target::Target;

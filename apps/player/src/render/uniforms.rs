@@ -2,7 +2,7 @@
 
 use super::View;
 use super::pipelines::Pipelines;
-use crate::content::Scene;
+use crate::scene::Scene;
 use bytemuck::{Pod, Zeroable};
 use cc4dgs_format::{Camera, blur_at};
 

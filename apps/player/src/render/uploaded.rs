@@ -3,7 +3,7 @@
 use super::pipelines::Pipelines;
 use super::uniforms::{Frame, functions};
 use super::{BLOCK, View};
-use crate::content::Scene;
+use crate::scene::Scene;
 use cc4dgs_format::playback::{Head, MAX_FUNCTIONS};
 use cc4dgs_format::{Error, Result};
 

@@ -127,7 +127,7 @@ impl Player {
         Ok(())
     }
     fn show(&mut self, content: Content, first: bool) -> Result<String, JsError> {
-        let Content { mut scene, presentation, frame_count, lacks_motion, bytes } = content;
+        let Content { mut scene, presentation, frame_count, lacks_motion, remarks, bytes } = content;
         scene.fit_harmonics(if let Output::Plain { most_words, .. } = &self.output { *most_words } else { u64::MAX });
         let (count, moving, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.gpu_bytes(), scene.bounds);
         let degrees = [scene.drawn_degree, scene.sh_degree];
@@ -154,7 +154,7 @@ impl Player {
         let names: Vec<&str> = self.cameras.iter().map(|c| c.name.as_str()).collect();
         let facts = serde_json::json!({
             "gaussians": count, "moving": moving, "shDegree": degrees[0], "storedDegree": degrees[1], "gpuBytes": gpu_bytes, "bytes": bytes,
-            "frames": frame_count, "seconds": seconds,
+            "frames": frame_count, "seconds": seconds, "remarks": remarks,
             "framesPerSecond": frame_count.saturating_sub(1).max(1) as f32 / seconds.max(1e-3), "cameras": names, "lacksMotion": lacks_motion,
         });
         Ok(facts.to_string())

@@ -9,8 +9,20 @@ use std::sync::atomic::Ordering;
 /// Share of the distance to the target that is flown per second.
 const FLIGHT: f64 = 1.0;
 
+/// A line with `text` at the top; whether it was closed.
+fn closed(ui: &mut egui::Ui, id: &'static str, text: &str) -> bool {
+    let mut closed = false;
+    egui::Panel::top(id).show(ui, |ui| {
+        ui.horizontal_wrapped(|ui| {
+            ui.label(text);
+            closed = ui.button("Close").clicked();
+        });
+    });
+    closed
+}
+
 impl Window {
-    /// The state of a training, and what went wrong.
+    /// The state of a training, what went wrong, what is not shown of a file, and what was done.
     pub(super) fn messages(&mut self, ui: &mut egui::Ui) {
         if let Some(live) = &self.live {
             let (status, paused, ended) = live.status();
@@ -35,15 +47,11 @@ impl Window {
             });
         }
         drop(trouble);
-        if let Some(text) = self.notice.clone() {
-            egui::Panel::top("notice").show(ui, |ui| {
-                ui.horizontal_wrapped(|ui| {
-                    ui.label(text);
-                    if ui.button("Close").clicked() {
-                        self.notice = None;
-                    }
-                });
-            });
+        if !self.remarks.is_empty() && closed(ui, "remarks", &self.remarks) {
+            self.remarks.clear();
+        }
+        if self.notice.as_deref().is_some_and(|text| closed(ui, "notice", text)) {
+            self.notice = None;
         }
     }
     pub(super) fn bar(&mut self, ui: &mut egui::Ui) {

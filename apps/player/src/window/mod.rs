@@ -117,6 +117,8 @@ struct Window {
     notice: Option<String>,
     lost: Lost,
     lacks_motion: bool,
+    /// What the file holds and is not shown; empty once it was read.
+    remarks: String,
     /// Size of the file; 0 where there is none.
     bytes: u64,
     /// Whether a model has been shown.
@@ -163,6 +165,7 @@ impl Window {
             notice: None,
             lost,
             lacks_motion: false,
+            remarks: String::new(),
             bytes: 0,
             loaded: false,
             resolution: 1.0,
@@ -196,7 +199,7 @@ impl Window {
     }
     /// Shows `content`; the first one sets camera and clock, later ones leave them.
     fn load(&mut self, content: Content) -> Result<()> {
-        let Content { scene, presentation, frame_count, lacks_motion, bytes } = content;
+        let Content { scene, presentation, frame_count, lacks_motion, remarks, bytes } = content;
         let ([lower, upper], seconds) = (scene.bounds, presentation.seconds_of(frame_count));
         self.renderer.load(scene)?;
         if !self.loaded {
@@ -204,7 +207,8 @@ impl Window {
             self.clock = Clock::new(frame_count, seconds);
         }
         (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
-        (self.cameras, self.lacks_motion, self.bytes, self.loaded) = (presentation.cameras, lacks_motion, bytes, true);
+        (self.cameras, self.lacks_motion, self.remarks) = (presentation.cameras, lacks_motion, remarks.join(" "));
+        (self.bytes, self.loaded) = (bytes, true);
         Ok(())
     }
     /// Takes what the training offered.
