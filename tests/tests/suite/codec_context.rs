@@ -4,8 +4,9 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_core::SceneOptions;
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Deformer, DeformerContext, EncodedWeights, Error, Event, ExtraAttribute, HostGaussians, Limits,
-    Plugin, Recorder, Registry, Result, Seed, Silent, Stream, TuneModel, TunedModel, Tuning, WeightArray, inventory,
+    AttributeCodec, AttributeSpec, Camera, CodecContext, CodecPlugin, DeclaredLoss, Deformer, DeformerContext, EncodedWeights, Error, Event, ExtraAttribute,
+    HostGaussians, Limits, Offsets, Parameter, ParameterGroup, Plugin, Recorder, Registry, Result, Seed, Silent, SpatialFeatures, SpatialInput, Stream,
+    TuneModel, TunedModel, Tuning, WeightArray, inventory,
 };
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
 use cc4dgs_play::Moving;
@@ -19,6 +20,7 @@ use cc4dgs_tests::larger;
 use cc4dgs_train::data;
 use std::cell::RefCell;
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The codec `raw`, which also records the parts of its context, and asks for the sizes of weights and files as a codec does whose size is bounded.
 struct Witness(Box<dyn AttributeCodec>);
@@ -30,7 +32,8 @@ impl AttributeCodec for Witness {
             let (image, drawn) = (views.image(0)?, renderer.render(gaussians, camera, time_norm)?.to_image());
             let moved = deformer.deform(gaussians, time_norm)?;
             let same_size = (image.width, image.height) == (drawn.width, drawn.height) && moved.len() == gaussians.len();
-            context.events.emit(&Event::Note { object: "codec witness".into(), message: format!("{} views, sizes agree: {same_size}", views.len()) });
+            let judges = context.judging_views().map(|judges| format!("{} {} views judge", judges.len(), judges.kind())).unwrap_or_default();
+            context.events.emit(&Event::Note { object: "codec witness".into(), message: format!("{} views, {judges}, sizes agree: {same_size}", views.len()) });
         }
         if let (Some(tuner), Some(file_bytes)) = (context.tuner, context.file_bytes) {
             let weights = tuner.start(gaussians)?.weights;
@@ -115,7 +118,12 @@ fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
         events.events().into_iter().filter_map(|e| if let Event::Note { message, .. } = e { Some(message) } else { None }).collect()
     };
     assert!(notes(None).is_empty());
-    assert_eq!(notes(Some(&scene)), [format!("{} views, sizes agree: true", SceneViews::new(&scene).len())]);
+    let count = SceneViews::new(&scene).len();
+    assert_eq!(notes(Some(&scene)), [format!("{count} views, {count} training views judge, sizes agree: true")]);
+    let scene = data::hold_out(&scene, 12).unwrap();
+    let judges = count - SceneViews::new(&scene).len();
+    assert!(judges > 0);
+    assert_eq!(notes(Some(&scene)), [format!("{} views, {judges} validation views judge, sizes agree: true", count - judges)]);
 }
 
 /// A tuner that notes in which steps it encodes weights.
@@ -210,7 +218,14 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     }
     let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", scene: None, tuner: None };
     let refused = model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap_err();
-    assert!(refused.to_string().contains("--scene"), "{refused}");
+    assert!(refused.to_string().contains("--scene") && refused.to_string().contains("--field-weights"), "{refused}");
+
+    // Validation views judge where there are some.
+    let (held_out, events) = (data::hold_out(&scene, 12).unwrap(), Recorder::default());
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=60dB", scene: Some((&held_out, &device)), tuner: None };
+    model.save_archive(&path, &options, &registry, &Limits::default(), &events).unwrap();
+    let judged = |event: &Event| matches!(event, Event::Note { message, .. } if message.contains("validation views (60 dB allowed)"));
+    assert!(events.events().iter().any(judged), "{:?}", events.events());
 
     // A bound on the size is one of the whole file.
     let size = |codec: &str, field_weights: &str| {
@@ -330,6 +345,57 @@ fn services_move_and_draw_as_playback_does() {
     for (i, (before, after)) in model.gaussians.means.chunks_exact(3).zip(moved.means.chunks_exact(3)).enumerate() {
         assert_eq!(before == after, i % 3 != 0, "Gaussian {i}: {before:?} became {after:?}");
     }
+}
+
+/// A deformer that counts how often it computes what does not depend on time.
+struct Counted {
+    inner: Box<dyn Deformer>,
+    spatial: AtomicUsize,
+}
+
+impl Deformer for Counted {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        self.spatial.fetch_add(1, Ordering::Relaxed);
+        self.inner.spatial(input)
+    }
+    fn attributes(&self) -> Vec<AttributeSpec> {
+        self.inner.attributes()
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        self.inner.deform(features, time_norm)
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.inner.parameters()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.inner.parameters_mut()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        self.inner.groups()
+    }
+}
+
+#[test]
+fn views_share_what_does_not_depend_on_time() {
+    let registry = Registry::collect().unwrap();
+    let deformer = Counted { inner: model(&registry).field.unwrap().field, spatial: AtomicUsize::new(0) };
+    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let services = ModelServices::new(&model, &registry, &device).unwrap().with_deformer(&deformer);
+    let views = SceneViews::new(&scene);
+    let shown: Vec<(&Camera, f32)> = [0.1, 0.5, 0.8].iter().enumerate().map(|(k, &time_norm)| (views.view(k * views.len() / 3).0, time_norm)).collect();
+    let mut images = Vec::new();
+    let drawn = services.render_views(&model.gaussians, &shown, &mut |k, drawn| {
+        images.push((k, drawn));
+        Ok(())
+    });
+    drawn.unwrap();
+    assert_eq!(deformer.spatial.swap(0, Ordering::Relaxed), 1);
+    assert_eq!(images.iter().map(|(k, _)| *k).collect::<Vec<_>>(), [0, 1, 2]);
+    for (k, drawn) in &images {
+        assert!(*drawn == services.render(&model.gaussians, shown[*k].0, shown[*k].1).unwrap(), "view {k}");
+    }
+    assert_eq!(deformer.spatial.load(Ordering::Relaxed), 3);
+    assert!(images[0].1 != images[2].1);
 }
 
 #[test]

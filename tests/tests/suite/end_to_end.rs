@@ -9,7 +9,6 @@ use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::agreement::agreement;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
-use cc4dgs_train::sweep::{Busy, CellResult, Cost, Grid, Plan, SweepFolder, TrainingState, Worker, run_training};
 use cc4dgs_train::train::{CONFIG, TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -288,28 +287,6 @@ fn runs_on_wgpu_are_reproducible_and_every_device_draws_the_same() {
     for found in agreement(&models, &scene, &scene.split(Split::Test), &registry, &Silent).unwrap() {
         assert!(found.max_difference <= 1.0 / 255.0 && found.psnr_difference_db.abs() < 0.01, "{found:?}");
     }
-}
-
-#[test]
-fn results_of_a_sweep_do_not_state_the_limits_of_a_machine() {
-    let grid = "name = 'small'\niterations = 40\nimages = 0\nmax_views = 1\nset = ['limits.max_depth=50']\n\
-                [[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\nfamily = 'demo'\n\
-                [[method]]\nname = 'still'\npreset = '+none'\n\
-                [[codec]]\nname = 'raw'\ncodec = 'raw'\n";
-    let (registry, folder, never) = (Registry::collect().unwrap(), tempfile::tempdir().unwrap(), AtomicBool::new(false));
-    let plan = Plan::expand(&Grid::parse("grid", grid).unwrap(), &registry, &|_: &RunConfig| Ok(())).unwrap();
-    let result = |name: &str, limits: &[&str]| -> cc4dgs_core::Result<CellResult> {
-        let limits: Vec<String> = limits.iter().map(ToString::to_string).collect();
-        let worker = Worker { registry: &registry, events: &Silent, stop: &never, limits: &limits, processes: 1 };
-        match run_training(&worker, &SweepFolder::new(folder.path().join(name)), &plan, 0, None, Busy::Wait)? {
-            TrainingState::Finished(mut results) => Ok(CellResult { cost: Cost::default(), ..results.remove(0) }),
-            TrainingState::Busy => panic!("nobody else works on it"),
-        }
-    };
-    let plain = result("plain", &[]).unwrap();
-    assert_eq!(result("limited", &["max_depth=40", "max_gaussians=100000"]).unwrap(), plain);
-    assert_eq!(plain.provenance.configuration["limits"]["max_depth"], 50);
-    assert!(matches!(result("refused", &["max_pixels=10"]), Err(Error::Limit { .. })), "they decide what is refused");
 }
 
 /// PSNR in dB that 40 iterations at 32x32 reach at least, by method: about 0.7 dB below what one seed gave on flex.

@@ -39,6 +39,8 @@ mod session;
 mod shortcuts;
 mod sort;
 mod sums;
+mod sweeps;
 mod tuning;
 mod view_sums;
+mod views_per_iteration;
 mod watchdog;

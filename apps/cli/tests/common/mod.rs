@@ -43,3 +43,27 @@ pub fn fail(args: &[&str], code: i32) -> String {
 pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
+
+pub fn read_json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+/// The smallest scene and the shortest training that goes through every stage.
+pub fn train_args<'a>(out: &'a str, iterations: &'a str) -> Vec<&'a str> {
+    vec![
+        "train",
+        "--scene",
+        "procedural:tiny",
+        "--preset",
+        "demo",
+        "--set",
+        iterations,
+        "--set",
+        "train.checkpoint_every=0",
+        "--device",
+        "flex",
+        "--out",
+        out,
+        "-q",
+    ]
+}

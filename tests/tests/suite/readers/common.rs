@@ -1,6 +1,6 @@
 //! Writers of tiny datasets.
 
-use cc4dgs_core::{Camera, Error, Limits, Registry, Scene, SceneOptions};
+use cc4dgs_core::{Camera, Error, Limits, Registry, Scene, SceneOptions, Split};
 use std::path::{Path, PathBuf};
 
 pub fn options() -> SceneOptions {
@@ -231,4 +231,9 @@ pub fn real(name: &str) -> Option<PathBuf> {
         return None;
     }
     Some(path)
+}
+
+/// Training and test views.
+pub fn train_count(scene: &Scene) -> (usize, usize) {
+    (scene.split(Split::Train).len(), scene.split(Split::Test).len())
 }
