@@ -62,6 +62,28 @@ impl TrainingViews for Views {
     }
 }
 
+/// Views of a split. Nobody may ask for the images of one that does not judge.
+struct OfSplit<'a> {
+    views: &'a Views,
+    judges: bool,
+}
+
+impl TrainingViews for OfSplit<'_> {
+    fn len(&self) -> usize {
+        self.views.len()
+    }
+    fn kind(&self) -> &'static str {
+        if self.judges { "validation" } else { "training" }
+    }
+    fn view(&self, index: usize) -> (&Camera, f32) {
+        self.views.view(index)
+    }
+    fn image(&self, index: usize) -> Result<Image8> {
+        assert!(self.judges, "a loss is measured on images of training views");
+        self.views.image(index)
+    }
+}
+
 #[derive(Default)]
 struct Notes(Mutex<Vec<String>>);
 
@@ -146,6 +168,25 @@ fn the_loss_is_kept_and_measured_steps_save_bytes() {
     assert!(rest(beside).unwrap() + (beside as usize) <= tight);
     let message = rest(tight as u64).unwrap_err().to_string();
     assert!(message.contains("weights of the deformer") && message.contains("--field-weights"), "{message}");
+}
+
+#[test]
+fn a_loss_is_measured_on_the_views_that_judge() {
+    cc4dgs_codecs::link();
+    let g = scene(300);
+    let (views, notes) = (recorded(&g), Notes::default());
+    let (training, judges) = (OfSplit { views: &views, judges: false }, OfSplit { views: &views, judges: true });
+    let context = CodecContext {
+        views: Some(&training),
+        judges: Some(&judges),
+        renderer: Some(&Blots),
+        dynamic_threshold: Some(f32::NEG_INFINITY),
+        ..CodecContext::new(Seed::root(1), Limits::default(), &notes)
+    };
+    let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)("max-drop=0.5dB", &toml::Table::new()).unwrap();
+    codec.encode(&g, &context).unwrap();
+    let said = notes.0.lock().unwrap();
+    assert!(said.iter().any(|note| note.contains("dB lower on 4 validation views (0.5 dB allowed)")), "{said:?}");
 }
 
 #[test]

@@ -144,7 +144,7 @@ pub struct Compress {
     /// Weight codec of the deformer, such as fp32, fp16, int8, compact, compact:bits=6 or compact:max-drop=0.01dB; see `cc4dgs plugins`.
     #[arg(long, value_name = "NAME[:SETTING]", default_value = "fp32")]
     pub field_weights: String,
-    /// The dataset that the model was trained on, for codecs that make use of its training views.
+    /// The dataset that the model was trained on, for codecs that make use of its views; validation views, else training views, judge what is lost.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
     /// The archive to write.

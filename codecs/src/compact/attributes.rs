@@ -3,7 +3,8 @@
 
 use super::blocks::{self, Blocks};
 use super::colors::{SMALL_CONTEXTS, code_small, slope};
-use super::encode::{Classes, Integers};
+use super::columns::Columns;
+use super::encode::Classes;
 use super::geometry::{CODE_LIMIT, Geometry};
 use super::predict::{GIVEN, Known, Linear};
 use super::sensitivity::{Growth, LARGEST, Sensitivity, moments, needed};
@@ -35,7 +36,7 @@ pub struct Coding {
 
 impl Coding {
     /// Plans the storage of an attribute, and says which rows are stored.
-    pub fn plan(gaussians: &HostGaussians, of: &Sensitivity, geometry: &Geometry, quality: f64) -> Option<(Self, Vec<bool>)> {
+    pub fn plan(gaussians: Columns, of: &Sensitivity, geometry: &Geometry, quality: f64) -> Option<(Self, Vec<bool>)> {
         let attribute = gaussians.extra.get(&of.name)?;
         let rows = needed(attribute, gaussians.len());
         let (origins, spread) = moments(attribute, &rows);
@@ -120,7 +121,7 @@ pub struct Coded<'a> {
 }
 
 impl<'a> Coded<'a> {
-    pub fn new(coding: &'a Coding, rows: &'a [bool], gaussians: &HostGaussians, geometry: &Geometry, scales: &[[i32; 3]], shapes: &[u8]) -> Option<Self> {
+    pub fn new(coding: &'a Coding, rows: &'a [bool], gaussians: Columns, geometry: &Geometry, scales: &[[i32; 3]], shapes: &[u8]) -> Option<Self> {
         let shifts: Vec<u8> = scales.iter().zip(shapes).map(|(&scales, &shape)| coding.shift(geometry, scales, shape)).collect();
         let codes = coding.quantise(&gaussians.extra.get(&coding.name)?.values, rows, &shifts)?;
         Some(Self { coding, rows, shifts, codes })
@@ -154,7 +155,7 @@ impl<'a> Coded<'a> {
         let mut out = vec![0.0; values.len()];
         for column in 0..width {
             let (codes, known) = self.column(column, &stored, classes);
-            let guesses = Linear::fit(1, &codes, &known).guesses(&codes, &known);
+            let guesses = Linear::fit(1, &codes, |i| known[i]).guesses(&codes, |i| known[i]);
             for (&i, guess) in stored.iter().zip(guesses) {
                 let (step, at) = (self.coding.step_of(self.shifts[i]), i * width + column);
                 out[at] = (slope((f64::from(values[at]) - f64::from(self.coding.origins[column])) / step - guess) / step) as f32;
@@ -173,13 +174,14 @@ fn known(color: u8, shape: u8, shift: u8, column: usize, before: impl Fn(usize) 
     out
 }
 
-/// The streams of all attributes of `sorted`, whose rows are those of `order`; `moving` is 0 or 1 per sorted row, where the file has it.
-pub fn write(sorted: &HostGaussians, of: &Integers, order: &[usize], moving: Option<&[u8]>) -> Result<Vec<Stream>> {
+/// The streams of all attributes of `gaussians`, of which some are `coded`, with rows in this `order`; `moving` is 0 or 1 per row in that order, where the file
+/// has it.
+pub fn write(gaussians: Columns, coded: &[Coded], classes: &Classes, order: &[usize], moving: Option<&[u8]>) -> Result<Vec<Stream>> {
     let (mut plain, mut plans, mut columns) = (HostGaussians::default(), Vec::new(), Vec::new());
-    for (name, attribute) in &sorted.extra {
-        let Some(coded) = of.attributes.iter().find(|coded| coded.coding.name == *name) else {
+    for (name, attribute) in gaussians.extra {
+        let Some(coded) = coded.iter().find(|coded| coded.coding.name == *name) else {
             plans.push(0);
-            plain.extra.insert(name.clone(), attribute.clone());
+            plain.extra.insert(name.clone(), attribute.select(order));
             continue;
         };
         let flags: Vec<u8> = order.iter().map(|&i| u8::from(coded.rows[i])).collect();
@@ -201,8 +203,8 @@ pub fn write(sorted: &HostGaussians, of: &Integers, order: &[usize], moving: Opt
         let stored = coded.stored(order);
         let rows = 0..stored.len();
         for column in 0..coded.width() {
-            let (codes, known) = coded.column(column, &stored, of.classes);
-            let plan = Linear::fit(1, &codes, &known);
+            let (codes, known) = coded.column(column, &stored, classes);
+            let plan = Linear::fit(1, &codes, |i| known[i]);
             plan.write(&mut plans);
             columns.extend(blocks::encode(&coded.coding.stream(column), Linear::contexts(1), slice::from_ref(&rows), |coder, range| {
                 plan.code(coder, &mut codes[range.clone()].to_vec(), &known[range])

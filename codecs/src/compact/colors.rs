@@ -1,7 +1,9 @@
 //! Colour coefficients: per spherical-harmonics degree a transform, and coordinates in steps that grow with the class.
 
+use super::blocks::ROWS;
+use super::columns::Rows;
 use super::entropy::{Coder, LANES, Lanes, behind, symbol_of};
-use super::transform::{Basis, analysis, basis, identity, scaled};
+use super::transform::{Basis, Moments, analysis, identity, scaled};
 use crate::jacobi;
 use cc4dgs_format::Result;
 use cc4dgs_format::archive::ByteReader;
@@ -26,8 +28,11 @@ const MEAN: f64 = 0.7;
 const BIT: f64 = 0.1155;
 /// Largest share of a step by which a coordinate is rounded towards zero.
 const FARTHEST: f64 = 0.4;
+/// Most coefficients times channels of a degree: those of degree 4.
+const MOST_DIMS: usize = 27;
 
 /// The coefficients of one degree, all channels.
+#[derive(PartialEq)]
 pub struct Degree {
     /// Number of coefficients times channels.
     pub dims: usize,
@@ -58,17 +63,61 @@ pub struct Transform {
 }
 
 impl Transform {
-    /// Of `rows` `[N,dims]`; `weights` `[N]` say how visible each is.
-    pub fn of(rows: &[f32], dims: usize, weights: &[f64], choices: &Choices) -> Self {
-        let n = (rows.len() / dims).max(1) as f64;
-        let mean: Vec<f32> = (0..dims).map(|c| (rows.iter().skip(c).step_by(dims).map(|&v| f64::from(v)).sum::<f64>() / n) as f32).collect();
-        let centred: Vec<f64> = rows.iter().enumerate().map(|(k, &v)| f64::from(v) - f64::from(mean[k % dims])).collect();
-        let found = choices.transform.then(|| basis(&centred, dims, weights)).and_then(|basis| Some((analysis(&basis, dims)?, basis)));
+    /// Of `rows`; `weights` `[N]` say how visible each is.
+    pub fn of(rows: Rows, weights: &[f64], choices: &Choices) -> Self {
+        let (dims, n) = (rows.dims, rows.count().max(1) as f64);
+        // A sum of nothing has the sign of zero that sums of iterators start with.
+        let mut sums: Vec<f64> = vec![std::iter::empty::<f64>().sum(); dims];
+        rows.iter().for_each(|row| sums.iter_mut().zip(row).for_each(|(sum, &v)| *sum += f64::from(v)));
+        let mean: Vec<f32> = sums.iter().map(|sum| (sum / n) as f32).collect();
+        let of_axes = || {
+            let mut moments = Moments::new(dims);
+            centred(rows, &mean, |first, block| moments.add(block, &weights[first..]));
+            let basis = moments.basis();
+            Some((analysis(&basis, dims)?, basis))
+        };
+        let found = if choices.transform { of_axes() } else { None };
         let (vectors, basis) = found.unwrap_or_else(|| (jacobi::identity(dims), identity(dims)));
-        let energy = |vector: &[f64]| centred.chunks_exact(dims).map(|row| project(vector, row).powi(2)).sum::<f64>();
-        let spread = vectors.par_chunks_exact(dims).map(|vector| (energy(vector) / n).sqrt()).collect();
+        let mut energies = vec![0.0; dims];
+        centred(rows, &mean, |_, block| {
+            let axes = energies.par_iter_mut().zip(vectors.par_chunks_exact(dims));
+            axes.for_each(|(energy, vector)| block.chunks_exact(dims).for_each(|row| *energy += project(vector, row).powi(2)));
+        });
+        let spread = energies.iter().map(|energy| (energy / n).sqrt()).collect();
         Self { dims, mean, basis, spread }
     }
+}
+
+/// Calls `work` with the index of the first row and the values `[M,dims]` of each block of rows, less their mean.
+fn centred(rows: Rows, mean: &[f32], mut work: impl FnMut(usize, &[f64])) {
+    let mut block = Vec::with_capacity(rows.count().min(ROWS) * rows.dims);
+    for first in (0..rows.count()).step_by(ROWS) {
+        block.clear();
+        let values = (first..rows.count().min(first + ROWS)).flat_map(|index| rows.row(index).iter().zip(mean));
+        block.extend(values.map(|(&v, &m)| f64::from(v) - f64::from(m)));
+        work(first, &block);
+    }
+}
+
+/// Codes of the rows of a degree.
+#[derive(Debug, PartialEq)]
+pub struct Codes {
+    /// `[N,dims]`; zeros in rows that have none.
+    pub values: Vec<i32>,
+    /// The rows that have none, because one would be out of range or all are stored exactly.
+    pub missing: Vec<usize>,
+}
+
+impl Codes {
+    /// Of `count` rows, none of which has codes.
+    pub fn none(count: usize, dims: usize) -> Self {
+        Self { values: vec![0; count * dims], missing: (0..count).collect() }
+    }
+}
+
+/// The rows that are not `coded`.
+pub fn missing(coded: &[bool]) -> Vec<usize> {
+    coded.iter().enumerate().filter(|(_, coded)| !**coded).map(|(row, _)| row).collect()
 }
 
 impl Degree {
@@ -81,26 +130,38 @@ impl Degree {
         let Transform { dims, mean, basis, spread } = transform;
         Self { dims: *dims, mean: mean.clone(), basis: basis.clone(), step, spread: spread.iter().map(octaves).collect() }
     }
-    /// Codes `[N,dims]` of `rows`; `None` for a row that is out of range.
-    pub fn quantise(&self, rows: &[f32], classes: &[u8], choices: &Choices) -> Vec<Option<Vec<i32>>> {
-        let Some(analysis) = analysis(&self.basis, self.dims) else { return vec![None; classes.len()] };
-        let quantise = |(row, &class): (&[f32], &u8)| {
-            let step = self.step_of(class);
-            let row: Vec<f64> = row.iter().zip(&self.mean).map(|(&v, &m)| f64::from(v) - f64::from(m)).collect();
-            let code = |c: usize| {
-                let steps = project(&analysis[c * self.dims..(c + 1) * self.dims], &row) / step;
-                let code = libm::copysign(self.rounded(steps.abs(), c, class, choices.rate_weight), steps);
-                (code.abs() < f64::from(1 << 24)).then_some(code as i32)
-            };
-            (0..self.dims).map(code).collect()
+    /// Codes of `rows`.
+    pub fn quantise(&self, rows: Rows, classes: &[u8], choices: &Choices) -> Codes {
+        let Some(analysis) = analysis(&self.basis, self.dims) else { return Codes::none(classes.len(), self.dims) };
+        let mut values = vec![0; classes.len() * self.dims];
+        let each = values.par_chunks_exact_mut(self.dims).zip(classes).enumerate();
+        let quantise = |(index, (codes, &class)): (usize, (&mut [i32], &u8))| {
+            let coded = self.quantise_row(&analysis, rows.row(index), class, choices.rate_weight, codes);
+            if !coded {
+                codes.fill(0);
+            }
+            coded
         };
-        rows.par_chunks_exact(self.dims).zip(classes).map(quantise).collect()
+        let coded: Vec<bool> = each.map(quantise).collect();
+        Codes { values, missing: missing(&coded) }
     }
-    /// The derivative of the estimated bits of all coordinates by each of the values `rows` `[N,dims]`; `guesses` `[N,dims]` are predictions in steps.
-    pub fn bit_slopes(&self, rows: &[f32], classes: &[u8], guesses: Option<&[f64]>) -> Vec<f32> {
-        let Some(analysis) = analysis(&self.basis, self.dims) else { return vec![0.0; rows.len()] };
-        let mut out = vec![0.0; rows.len()];
-        for (i, ((out, row), &class)) in out.chunks_exact_mut(self.dims).zip(rows.chunks_exact(self.dims)).zip(classes).enumerate() {
+    /// Puts the codes of a row into `codes`; whether all are in range.
+    fn quantise_row(&self, analysis: &[f64], row: &[f32], class: u8, rate_weight: f64, codes: &mut [i32]) -> bool {
+        let (step, mut centred) = (self.step_of(class), [0.0; MOST_DIMS]);
+        let centred = &mut centred[..self.dims];
+        centred.iter_mut().zip(row.iter().zip(&self.mean)).for_each(|(to, (&v, &m))| *to = f64::from(v) - f64::from(m));
+        codes.iter_mut().enumerate().all(|(c, out)| {
+            let steps = project(&analysis[c * self.dims..(c + 1) * self.dims], centred) / step;
+            let code = libm::copysign(self.rounded(steps.abs(), c, class, rate_weight), steps);
+            *out = code as i32;
+            code.abs() < f64::from(1 << 24)
+        })
+    }
+    /// The derivative `[N,dims]` of the estimated bits of all coordinates by each of the values `rows`; `guesses` `[N,dims]` are predictions in steps.
+    pub fn bit_slopes(&self, rows: Rows, classes: &[u8], guesses: Option<&[f64]>) -> Vec<f32> {
+        let mut out = vec![0.0; rows.count() * self.dims];
+        let Some(analysis) = analysis(&self.basis, self.dims) else { return out };
+        for (i, ((out, row), &class)) in out.chunks_exact_mut(self.dims).zip(rows.iter()).zip(classes).enumerate() {
             let step = self.step_of(class);
             let row: Vec<f64> = row.iter().zip(&self.mean).map(|(&v, &m)| f64::from(v) - f64::from(m)).collect();
             let mut sums = vec![0.0; self.dims];

@@ -1,12 +1,12 @@
 //! From Gaussians to integers: classes, canonical rotations, codes, and rows that are stored exactly.
 
 use super::attributes::Coded;
-use super::colors::{Choices, Degree};
+use super::colors::{Choices, Codes, missing};
+use super::columns::Columns;
 use super::geometry::{CODE_LIMIT, Rotation, companded};
 use super::joint::Directions;
 use super::plan::Plan;
 use super::write::APART;
-use cc4dgs_format::HostGaussians;
 use rayon::prelude::*;
 
 /// The coarsest class.
@@ -27,20 +27,30 @@ pub struct Integers<'a> {
     pub rotations: Vec<Rotation>,
     pub opacities: Vec<i32>,
     pub keys: Vec<u64>,
-    /// `[N,dims]` per degree.
-    pub colors: Vec<Vec<i32>>,
+    /// Of each degree.
+    pub colors: Vec<Codes>,
     /// Attributes of plug-ins that are coded; others are stored as they may be.
     pub attributes: Vec<Coded<'a>>,
-    /// Rows whose values are stored as float32, by column: means, log-scales, quaternions, opacity logits, then degrees.
-    pub exact: Vec<Vec<usize>>,
+    /// Rows of means, log-scales, quaternions and opacity logits whose values are stored as float32; those of colours are [`Codes::missing`].
+    pub exact: [Vec<usize>; 4],
 }
 
-/// Whether a row's axes and the sign and norm of its quaternion are free to choose, because nothing is added to them.
-pub fn canonical(gaussians: &HostGaussians, free: &[bool]) -> HostGaussians {
-    let mut out = gaussians.clone();
-    let rows = out.quaternions.par_chunks_exact_mut(4).zip(out.log_scales.par_chunks_exact_mut(3)).zip(free);
+impl Integers<'_> {
+    /// Rows whose values are stored as float32, by column: means, log-scales, quaternions, opacity logits, then degrees.
+    pub fn exact_rows(&self) -> impl Iterator<Item = &[usize]> {
+        self.exact.iter().chain(self.colors.iter().map(|codes| &codes.missing)).map(Vec::as_slice)
+    }
+    /// The codes of colours alone.
+    pub fn into_colors(self) -> Vec<Codes> {
+        self.colors
+    }
+}
+
+/// Brings log-scales `[N,3]` and quaternions `[N,4]` into canonical form where they are `free`: nothing is added to them, so the order of the axes and the sign
+/// and norm of the quaternion can be chosen.
+pub fn make_canonical(log_scales: &mut [f32], quaternions: &mut [f32], free: &[bool]) {
+    let rows = quaternions.par_chunks_exact_mut(4).zip(log_scales.par_chunks_exact_mut(3)).zip(free);
     rows.filter(|(_, free)| **free).for_each(|((q, s), _)| canonical_row(q, s));
-    out
 }
 
 /// Sorts the scales, largest first, and turns the quaternion to the one of its kind with the largest w.
@@ -122,8 +132,47 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
 }
 
 impl Plan {
-    /// The integers of canonical Gaussians, as many as those that were planned for. With `directions`, colours are rounded together if they may be.
-    pub fn quantise<'a>(&'a self, gaussians: &HostGaussians, free: &[bool], classes: &'a Classes, directions: Option<&Directions>) -> Integers<'a> {
+    /// Whether the coefficients of a degree are rounded; else they are stored exactly.
+    fn rounds_degree(&self, degree: usize) -> bool {
+        self.rounds[if degree == 0 { 4 } else { 5 }]
+    }
+    fn choices_of(&self, degree: usize) -> Choices {
+        Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices }
+    }
+    /// Whether `other`, of the same planner, gives the coefficients of a degree the same codes where degrees are rounded apart.
+    fn rounds_alike(&self, other: &Self, degree: usize) -> bool {
+        self.degrees.get(degree) == other.degrees.get(degree) && self.rounds_degree(degree) == other.rounds_degree(degree)
+    }
+    /// The codes of the colours of canonical Gaussians, by degree. With `directions`, colours are rounded together if they may be. `before` are the codes of
+    /// the same Gaussians with another plan of the same planner: they are taken for degrees that are rounded alike.
+    pub fn color_codes(&self, gaussians: Columns, classes: &Classes, directions: Option<&Directions>, before: Option<(Self, Vec<Codes>)>) -> Vec<Codes> {
+        let directions_of = |plan: &Self| directions.filter(|_| plan.joint);
+        let together = directions_of(self);
+        let mut known: Vec<Option<Codes>> = self.degrees.iter().map(|_| None).collect();
+        if let Some((plan, codes)) = before.filter(|(plan, _)| directions_of(plan).is_some() == together.is_some()) {
+            let alike = |(degree, codes): (usize, Codes)| Some(codes).filter(|_| self.rounds_alike(&plan, degree));
+            known = codes.into_iter().enumerate().map(alike).collect();
+        }
+        let exact = |dims: usize| Codes::none(gaussians.len(), dims);
+        if let Some(directions) = together.filter(|_| known.iter().any(Option::is_none)) {
+            // A degree makes up for the errors of those above it.
+            drop(known);
+            let rounds: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds_degree(degree)).collect();
+            let choices: Vec<Choices> = (0..self.degrees.len()).map(|degree| self.choices_of(degree)).collect();
+            let found = directions.quantise(&self.degrees, gaussians, &classes.colors, &rounds, &choices);
+            return found.into_iter().zip(&self.degrees).zip(rounds).map(|((codes, plan), rounds)| if rounds { codes } else { exact(plan.dims) }).collect();
+        }
+        let alone = |degree: usize| {
+            let plan = &self.degrees[degree];
+            if !self.rounds_degree(degree) {
+                return exact(plan.dims);
+            }
+            plan.quantise(gaussians.coefficients(degree), &classes.colors, &self.choices_of(degree))
+        };
+        known.into_iter().enumerate().map(|(degree, known)| known.unwrap_or_else(|| alone(degree))).collect()
+    }
+    /// The integers of canonical Gaussians, as many as those that were planned for, whose `colors` have been rounded.
+    pub fn quantise<'a>(&'a self, gaussians: Columns, free: &[bool], classes: &'a Classes, colors: Vec<Codes>) -> Integers<'a> {
         let (geometry, shapes, n) = (&self.geometry, &classes.shapes, gaussians.len());
         let (scales, exact_scales) = each(n, |i| {
             let (values, step) = (&gaussians.log_scales[3 * i..3 * i + 3], geometry.scale_step_of(shapes[i]));
@@ -147,38 +196,18 @@ impl Plan {
             let logit = gaussians.opacity_logits[i];
             code(companded(logit) / geometry.opacity_step_of(shapes[i])).filter(|_| self.rounds[3] && logit.abs() < LOGIT_LIMIT)
         });
-        let mut exact = vec![exact_means, exact_scales, exact_rotations, exact_opacities];
-        let rounds: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds[if degree == 0 { 4 } else { 5 }]).collect();
-        let choices_of = |degree: usize| Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices };
-        let choices: Vec<Choices> = (0..self.degrees.len()).map(choices_of).collect();
-        let alone = |(degree, plan): (usize, &Degree)| plan.quantise(&coefficients(gaussians, degree), &classes.colors, &choices[degree]);
-        let found = match directions.filter(|_| self.joint) {
-            Some(directions) => directions.quantise(&self.degrees, gaussians, &classes.colors, &rounds, &choices),
-            None => self.degrees.iter().enumerate().map(alone).collect(),
-        };
-        let mut colors = Vec::new();
-        for ((plan, rows), rounds) in self.degrees.iter().zip(found).zip(rounds) {
-            let mut missing = Vec::new();
-            let mut codes = vec![0; n * plan.dims];
-            for (i, (row, out)) in rows.into_iter().zip(codes.chunks_exact_mut(plan.dims)).enumerate() {
-                match row.filter(|_| rounds) {
-                    Some(row) => out.copy_from_slice(&row),
-                    None => missing.push(i),
-                }
-            }
-            exact.push(missing);
-            colors.push(codes);
-        }
         let attributes = self.attributes.iter().filter_map(|(coding, rows)| Coded::new(coding, rows, gaussians, geometry, &scales, shapes)).collect();
+        let exact = [exact_means, exact_scales, exact_rotations, exact_opacities];
         Integers { plan: self, classes, scales, rotations, opacities, keys, colors, attributes, exact }
     }
 }
 
 /// The codes of `n` rows, and the rows that have none.
 fn each<T: Default + Send>(n: usize, code: impl Fn(usize) -> Option<T> + Send + Sync) -> (Vec<T>, Vec<usize>) {
-    let found: Vec<Option<T>> = (0..n).into_par_iter().map(code).collect();
-    let missing = found.iter().enumerate().filter(|(_, code)| code.is_none()).map(|(i, _)| i).collect();
-    (found.into_iter().map(Option::unwrap_or_default).collect(), missing)
+    let (mut codes, mut coded) = (Vec::new(), Vec::new());
+    let row = |i: usize| code(i).map_or_else(|| (T::default(), false), |code| (code, true));
+    (0..n).into_par_iter().map(row).unzip_into_vecs(&mut codes, &mut coded);
+    (codes, missing(&coded))
 }
 
 fn code(steps: f64) -> Option<i32> {
@@ -186,14 +215,46 @@ fn code(steps: f64) -> Option<i32> {
     (code.abs() < CODE_LIMIT as f64).then_some(code as i32)
 }
 
-/// The coefficients of one degree `[N, 3 (2 degree + 1)]`.
-pub fn coefficients(gaussians: &HostGaussians, degree: usize) -> Vec<f32> {
-    if degree == 0 {
-        return gaussians.sh_dc.clone();
+#[cfg(test)]
+mod tests {
+    use super::super::importance;
+    use super::super::plan::{Bounds, Planner};
+    use super::*;
+    use cc4dgs_format::{CodecContext, HostGaussians, Limits, Seed, Silent};
+
+    #[test]
+    fn codes_are_kept_where_a_plan_rounds_colours_as_the_one_before() {
+        let draw = |k: usize, column: usize| (Seed::root(column as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+        let mut g = HostGaussians { sh_degree: 2, opacity_logits: vec![0.0; 80], ..Default::default() };
+        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
+            *values = (0..80 * width).map(|k| draw(k, column)).collect();
+        }
+        let columns = Columns::from(&g);
+        let importance = importance::estimate(&g, &CodecContext::new(Seed::root(1), Limits::default(), &Silent));
+        let classes = classify(&importance.weights, &importance.shapes, true);
+        let planner = Planner::new(columns, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
+        let directions = Directions::new(80, 2).factored();
+        let plan = |largest: [f64; 6], joint: bool| planner.plan(0.02, &[1.0; 6], &Bounds { largest, joint });
+        let (all, centres, harmonics) = ([1.0; 6], [0.5, 1.0, 1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0, 1.0, 0.5]);
+        let kept = |directions: Option<&Directions>, largest: [f64; 6], joint: bool| -> Vec<bool> {
+            let before = plan(all, true);
+            let mut codes = before.color_codes(columns, &classes, directions, None);
+            // What is kept can be told from what is rounded again.
+            codes.iter_mut().for_each(|codes| codes.values[0] += 1000);
+            let wanted: Vec<i32> = codes.iter().map(|codes| codes.values[0]).collect();
+            let next = plan(largest, joint);
+            let found = next.color_codes(columns, &classes, directions, Some((before, codes)));
+            let afresh = next.color_codes(columns, &classes, directions, None);
+            let kept: Vec<bool> = found.iter().zip(wanted).map(|(found, wanted)| found.values[0] == wanted).collect();
+            assert!(kept.iter().zip(found.iter().zip(&afresh)).all(|(kept, (found, afresh))| *kept || found == afresh));
+            kept
+        };
+        assert_eq!(kept(None, centres, true), [true; 3]);
+        assert_eq!(kept(None, harmonics, true), [true, false, false]);
+        assert_eq!(kept(None, [0.0; 6], true), [false; 3], "stored exactly");
+        // Together, each depends on those above it.
+        assert_eq!(kept(Some(&directions), centres, true), [true; 3]);
+        assert_eq!(kept(Some(&directions), harmonics, true), [false; 3]);
+        assert_eq!(kept(Some(&directions), centres, false), [false; 3], "apart");
     }
-    let width = 3 * cc4dgs_format::gaussians::sh_rest_len(gaussians.sh_degree);
-    let (from, to) = (3 * (degree * degree - 1), 3 * ((degree + 1) * (degree + 1) - 1));
-    let mut out = Vec::with_capacity(gaussians.len() * (to - from));
-    gaussians.sh_rest.chunks_exact(width).for_each(|row| out.extend_from_slice(&row[from..to]));
-    out
 }

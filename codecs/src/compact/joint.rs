@@ -5,9 +5,9 @@
 //! direction, errors e of the coefficients of a channel add eᵀ M e to the squared error of images. Degrees are rounded from the highest to the lowest, each to
 //! the nearest of what is best given the errors of those before (the nearest-plane algorithm of Babai 1986, a degree at a time). Files decode as they always did.
 
-use super::colors::{Choices, Degree};
-use super::encode::coefficients;
-use cc4dgs_format::{Camera, HostGaussians};
+use super::colors::{Choices, Codes, Degree};
+use super::columns::{Columns, Rows};
+use cc4dgs_format::Camera;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -66,9 +66,6 @@ fn start(row: usize) -> usize {
     row * (row + 1) / 2
 }
 
-/// Codes of the rows of a degree; `None` for one that is out of range.
-type Codes = Vec<Option<Vec<i32>>>;
-
 impl Directions {
     /// Of `count` Gaussians with harmonics of `degree`, seen by `views`: each adds itself by [`Directions::add`].
     pub fn new(count: usize, degree: usize) -> Self {
@@ -103,49 +100,52 @@ impl Directions {
     }
     /// Codes of all `degrees` of `gaussians`, which are as many as views were added for. A degree that `rounds` says is not rounded is stored exactly, as are rows that
     /// are out of range.
-    pub fn quantise(&self, degrees: &[Degree], gaussians: &HostGaussians, classes: &[u8], rounds: &[bool], choices: &[Choices]) -> Vec<Codes> {
-        let values: Vec<Vec<f32>> = (0..degrees.len()).map(|degree| coefficients(gaussians, degree)).collect();
+    pub fn quantise(&self, degrees: &[Degree], gaussians: Columns, classes: &[u8], rounds: &[bool], choices: &[Choices]) -> Vec<Codes> {
         let starts: Vec<usize> = (0..classes.len()).step_by(CHUNK).collect();
-        let chunk = |first: usize| {
-            let rows = first..classes.len().min(first + CHUNK);
-            let values: Vec<&[f32]> = degrees.iter().zip(&values).map(|(degree, all)| &all[rows.start * degree.dims..rows.end * degree.dims]).collect();
-            self.quantise_rows(degrees, &values, &classes[rows.clone()], rounds, choices, rows)
-        };
+        let chunk = |first: usize| self.quantise_rows(degrees, gaussians, classes, rounds, choices, first..classes.len().min(first + CHUNK));
         let chunks: Vec<Vec<Codes>> = starts.into_par_iter().map(chunk).collect();
-        let mut out: Vec<Codes> = degrees.iter().map(|_| Vec::with_capacity(classes.len())).collect();
-        for chunk in chunks {
-            out.iter_mut().zip(chunk).for_each(|(all, rows)| all.extend(rows));
+        let whole = |plan: &Degree| Codes { values: Vec::with_capacity(classes.len() * plan.dims), missing: Vec::new() };
+        let mut out: Vec<Codes> = degrees.iter().map(whole).collect();
+        for (k, chunk) in chunks.into_iter().enumerate() {
+            for (all, rows) in out.iter_mut().zip(chunk) {
+                all.values.extend(rows.values);
+                all.missing.extend(rows.missing.into_iter().map(|row| k * CHUNK + row));
+            }
         }
         out
     }
-    /// The same of some rows, whose `values` by degree and whose `classes` these are.
-    fn quantise_rows(&self, degrees: &[Degree], values: &[&[f32]], classes: &[u8], rounds: &[bool], choices: &[Choices], rows: Range<usize>) -> Vec<Codes> {
-        let triangles = &self.triangles[rows.start * start(self.functions)..rows.end * start(self.functions)];
+    /// The same of some `rows` of all.
+    fn quantise_rows(&self, degrees: &[Degree], gaussians: Columns, classes: &[u8], rounds: &[bool], choices: &[Choices], rows: Range<usize>) -> Vec<Codes> {
+        let (triangles, classes) = (&self.triangles[rows.start * start(self.functions)..rows.end * start(self.functions)], &classes[rows.clone()]);
         // Errors so far, by row, channel and function.
         let mut errors = vec![[[0.0f64; MOST]; CHANNELS]; rows.len()];
-        let mut out: Vec<Codes> = degrees.iter().map(|_| Vec::new()).collect();
+        let mut out = Vec::with_capacity(degrees.len());
         for (degree, plan) in degrees.iter().enumerate().rev() {
-            let (dims, first) = (plan.dims, degree * degree);
-            let mut wanted = values[degree].to_vec();
+            let (dims, first, given) = (plan.dims, degree * degree, gaussians.coefficients(degree));
+            let mut wanted: Vec<f32> = rows.clone().flat_map(|row| given.row(row)).copied().collect();
             for ((wanted, errors), triangle) in wanted.chunks_exact_mut(dims).zip(&errors).zip(triangles.chunks_exact(start(self.functions))) {
                 for (channel, errors) in errors.iter().enumerate() {
                     let shifts = compensation(triangle, self.functions, first..first + dims / CHANNELS, errors);
                     shifts.iter().take(dims / CHANNELS).enumerate().for_each(|(f, shift)| wanted[CHANNELS * f + channel] += *shift as f32);
                 }
             }
-            let codes = plan.quantise(&wanted, classes, &choices[degree]);
+            let codes = plan.quantise(Rows::of(&wanted, dims), classes, &choices[degree]);
             let basis = plan.scaled_basis();
             let mut restored = vec![0.0f32; dims];
-            for ((codes, errors), (value, &class)) in codes.iter().zip(&mut errors).zip(values[degree].chunks_exact(dims).zip(classes)) {
-                // What is stored exactly has no error.
-                let Some(codes) = codes.as_ref().filter(|_| rounds[degree]) else { continue };
-                plan.restore(&basis, codes, class, &mut restored);
-                for (at, (restored, value)) in restored.iter().zip(value).enumerate() {
+            // What is stored exactly has no error.
+            let mut exact = codes.missing.iter().copied().peekable();
+            for (k, (values, errors)) in codes.values.chunks_exact(dims).zip(&mut errors).enumerate().filter(|_| rounds[degree]) {
+                if exact.next_if_eq(&k).is_some() {
+                    continue;
+                }
+                plan.restore(&basis, values, classes[k], &mut restored);
+                for (at, (restored, value)) in restored.iter().zip(given.row(rows.start + k)).enumerate() {
                     errors[at % CHANNELS][first + at / CHANNELS] = f64::from(*restored) - f64::from(*value);
                 }
             }
-            out[degree] = codes;
+            out.push(codes);
         }
+        out.reverse();
         out
     }
 }
@@ -198,6 +198,7 @@ fn factor(triangle: &mut [f32], functions: usize) -> bool {
 mod tests {
     use super::super::colors::Transform;
     use super::*;
+    use cc4dgs_format::HostGaussians;
 
     /// Directions of one Gaussian at the origin, which cameras see from one side.
     fn one_sided(degree: usize) -> (Directions, Vec<[f64; MOST]>) {
@@ -247,9 +248,9 @@ mod tests {
         // One row has no mean of its own: planned beside its opposite.
         let degrees: Vec<Degree> = (0..3)
             .map(|d| {
-                let rows = coefficients(&gaussians, d);
-                let both: Vec<f32> = rows.iter().copied().chain(rows.iter().map(|v| -v)).collect();
-                Degree::plan(&Transform::of(&both, rows.len(), &[1.0, 1.0], &choices[0]), [0.02, 0.3, 0.3][d])
+                let row = Columns::from(&gaussians).coefficients(d).row(0);
+                let both: Vec<f32> = row.iter().copied().chain(row.iter().map(|v| -v)).collect();
+                Degree::plan(&Transform::of(Rows::of(&both, row.len()), &[1.0, 1.0], &choices[0]), [0.02, 0.3, 0.3][d])
             })
             .collect();
         let error = |codes: &[Codes]| {
@@ -258,20 +259,21 @@ mod tests {
                 .zip(codes)
                 .flat_map(|(plan, codes)| {
                     let mut out = vec![0.0; plan.dims];
-                    plan.restore(&plan.scaled_basis(), codes[0].as_ref().unwrap(), 0, &mut out);
+                    plan.restore(&plan.scaled_basis(), &codes.values, 0, &mut out);
                     out
                 })
                 .collect();
             let of = |y: &[f64; MOST], c: usize| (0..9).map(|f| f64::from(restored[3 * f + c] - values[3 * f + c]) * y[f]).sum::<f64>().powi(2);
             seen.iter().flat_map(|y| (0..3).map(move |c| of(y, c))).sum::<f64>()
         };
-        let apart: Vec<Codes> = degrees.iter().enumerate().map(|(d, plan)| plan.quantise(&coefficients(&gaussians, d), &[0], &choices[d])).collect();
-        let together = directions.quantise(&degrees, &gaussians, &[0], &[true; 3], &choices);
+        let columns = Columns::from(&gaussians);
+        let apart: Vec<Codes> = degrees.iter().enumerate().map(|(d, plan)| plan.quantise(columns.coefficients(d), &[0], &choices[d])).collect();
+        let together = directions.quantise(&degrees, columns, &[0], &[true; 3], &choices);
         assert!(error(&together) < 0.1 * error(&apart), "{} and {}", error(&together), error(&apart));
         // What is stored exactly leaves nothing to make up for.
-        assert!(directions.quantise(&degrees, &gaussians, &[0], &[true, true, false], &choices)[..2] != together[..2]);
-        assert_eq!(directions.quantise(&degrees, &gaussians, &[0], &[false, false, false], &choices), apart);
+        assert!(directions.quantise(&degrees, columns, &[0], &[true, true, false], &choices)[..2] != together[..2]);
+        assert_eq!(directions.quantise(&degrees, columns, &[0], &[false, false, false], &choices), apart);
         // Without a view, all is as before.
-        assert_eq!(Directions::new(1, 2).factored().quantise(&degrees, &gaussians, &[0], &[true; 3], &choices), apart);
+        assert_eq!(Directions::new(1, 2).factored().quantise(&degrees, columns, &[0], &[true; 3], &choices), apart);
     }
 }

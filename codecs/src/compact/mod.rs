@@ -10,16 +10,20 @@ mod attributes;
 mod bits;
 mod blocks;
 mod colors;
+mod columns;
 mod encode;
 mod entropy;
 mod forecast;
 mod geometry;
+mod images;
 mod importance;
+mod job;
 mod joint;
 mod layers;
 mod plan;
 mod predict;
 mod read;
+mod restore;
 mod rounding;
 mod search;
 mod sensitivity;
@@ -31,13 +35,11 @@ mod write;
 
 pub(crate) use weights::build as build_weights;
 
-use cc4dgs_format::storage::column_loss;
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
 use colors::Choices;
-use encode::Integers;
-use joint::Directions;
-use plan::{Bounds, Factors, Plan, Planner};
-use rayon::prelude::*;
+use columns::Columns;
+use job::Job;
+use plan::Planner;
 use settings::Settings;
 use std::cell::Cell;
 use write::Motion;
@@ -56,124 +58,11 @@ const LOSSES: [(&str, f64); 7] = [
     // One of two levels, each the mean of its scores.
     ("dynamic_scores", 1.0),
 ];
-/// Reductions of a column's largest step until its loss is allowed; then the whole column is stored exactly.
-const REDUCTIONS: usize = 12;
-/// The share of the declared loss that a smaller step aims at, and by how much steps become smaller at a time: errors grow in proportion to steps where these
-/// are small.
-const LOSS_AIM: f64 = 0.9;
-const SMALLER: std::ops::RangeInclusive<f64> = 0.02..=0.5;
 /// Times at which the deformer is asked what it changes.
 const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
 
 struct Compact {
     settings: Settings,
-}
-
-/// What does not change from one attempt to the next.
-struct Job<'a> {
-    /// Of the Gaussians to encode.
-    planner: Planner<'a>,
-    free: Vec<bool>,
-    /// From where Gaussians are seen, where colours are rounded together.
-    directions: Option<&'a Directions>,
-    /// The layer of each Gaussian, and how many each layer has.
-    layers: (Vec<u8>, Vec<usize>),
-    motion: Motion,
-    /// Of the columns, to start with.
-    factors: Factors,
-    /// Whether colours are rounded together: not any more once that has exceeded the declared loss, so that attempts can be compared.
-    joint: Cell<bool>,
-}
-
-#[cfg(test)]
-thread_local! {
-    /// How often this thread has quantised the Gaussians of a [`Job`].
-    static QUANTISED: Cell<usize> = const { Cell::new(0) };
-}
-
-/// Gaussians rounded in the steps of a quality.
-struct Attempt {
-    quality: f64,
-    /// How the values were rounded.
-    plan: Plan,
-    /// What they will be decoded to, in the order in which they are stored, which decides images where depths are equal. Dynamic scores, and attributes that are
-    /// stored as their plug-ins allow, are the originals.
-    rounded: HostGaussians,
-}
-
-impl Job<'_> {
-    /// Rounds the Gaussians to encode.
-    fn attempt(&self, quality: f64) -> Result<Attempt> {
-        Ok(self.attempt_with(&self.planner, quality, &self.factors, |_, _| Ok(()))?.0)
-    }
-    /// Rounds the Gaussians of `planner` and codes them.
-    fn coded_attempt(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<(Attempt, Vec<Stream>)> {
-        self.attempt_with(planner, quality, factors, |of, order| self.write(planner.gaussians, of, order))
-    }
-    /// Rounds the Gaussians of `planner` in steps that keep the declared loss. `encode` gets their integers and the order in which rows are stored.
-    fn attempt_with<T>(
-        &self,
-        planner: &Planner,
-        quality: f64,
-        factors: &Factors,
-        encode: impl FnOnce(&Integers, &[usize]) -> Result<T>,
-    ) -> Result<(Attempt, T)> {
-        let mut bounds = Bounds { joint: self.joint.get(), ..Bounds::NONE };
-        // Colours may be rounded apart, and each column be stored exactly in the end.
-        for reductions in 0..REDUCTIONS + 2 + factors.len() {
-            let plan = planner.plan(quality, factors, &bounds);
-            let of = self.quantise(planner.gaussians, &plan);
-            let rounded = rounding::restored(&of, planner.gaussians);
-            let (together, mut kept) = (bounds.joint && self.directions.is_some(), true);
-            for (((name, width, before), (_, _, after)), factor) in planner.gaussians.columns().into_iter().zip(rounded.columns()).zip(&mut bounds.largest) {
-                let allowed = LOSSES.iter().find(|l| l.0 == name).map_or(0.0, |l| l.1);
-                let lost = column_loss(name, before, after, width);
-                // A small part of it is left for what rounding adds.
-                if lost.is_nan() || lost > 0.999 * allowed {
-                    kept = false;
-                    if together && name.starts_with("sh_") {
-                        bounds.joint = false;
-                        self.joint.set(false);
-                        continue;
-                    }
-                    let smaller = (LOSS_AIM * allowed / lost).clamp(*SMALLER.start(), *SMALLER.end());
-                    *factor *= if reductions < REDUCTIONS && lost.is_finite() { smaller } else { 0.0 };
-                }
-            }
-            if kept {
-                let order = self.order(&of);
-                let (found, rounded) = (encode(&of, &order)?, rounded.select(&order));
-                return Ok((Attempt { quality, plan, rounded }, found));
-            }
-        }
-        Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
-    }
-    fn quantise<'a>(&'a self, gaussians: &HostGaussians, plan: &'a Plan) -> Integers<'a> {
-        #[cfg(test)]
-        QUANTISED.set(QUANTISED.get() + 1);
-        plan.quantise(gaussians, &self.free, self.planner.classes, self.directions)
-    }
-    /// The streams of canonical Gaussians as `plan` rounds them.
-    fn streams(&self, gaussians: &HostGaussians, plan: &Plan) -> Result<Vec<Stream>> {
-        let of = self.quantise(gaussians, plan);
-        self.write(gaussians, &of, &self.order(&of))
-    }
-    /// The same streams, and what they will be decoded to, as in [`Attempt::rounded`].
-    fn stored(&self, gaussians: &HostGaussians, plan: &Plan) -> Result<(Vec<Stream>, HostGaussians)> {
-        let of = self.quantise(gaussians, plan);
-        let order = self.order(&of);
-        Ok((self.write(gaussians, &of, &order)?, rounding::restored(&of, gaussians).select(&order)))
-    }
-    /// The streams of `gaussians`, whose integers are `of`.
-    fn write(&self, gaussians: &HostGaussians, of: &Integers, order: &[usize]) -> Result<Vec<Stream>> {
-        write::write(gaussians, of, &self.motion, order, &self.layers.1)
-    }
-    /// The order in which rows are stored.
-    fn order(&self, of: &Integers) -> Vec<usize> {
-        let (mut order, layers): (Vec<usize>, _) = ((0..of.keys.len()).collect(), &self.layers.0);
-        order.par_sort_by_key(|&i| (layers[i], of.keys[i], i));
-        order
-    }
 }
 
 /// The bytes of all streams.
@@ -182,6 +71,28 @@ fn bytes_of(streams: &[Stream]) -> usize {
 }
 
 impl Compact {
+    /// The streams of valid Gaussians.
+    fn streams(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        let measured = if self.settings.measured {
+            importance::measure(gaussians, context, self.settings.adaptive && self.settings.shapes, self.settings.joint)?
+        } else {
+            None
+        };
+        let mut importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
+        let (motion, free) = self.motion(gaussians, context)?;
+        let (mut log_scales, mut quaternions) = (gaussians.log_scales.clone(), gaussians.quaternions.clone());
+        encode::make_canonical(&mut log_scales, &mut quaternions, &free);
+        let canonical = Columns { log_scales: &log_scales, quaternions: &quaternions, ..Columns::from(gaussians) };
+        let classes = encode::classify(&importance.weights, &importance.shapes, self.settings.adaptive);
+        if self.settings.measured {
+            importance.attributes = sensitivity::measure(canonical, &classes, context, search::estimate(self.settings.psnr_db, &importance))?;
+        }
+        let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
+        let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
+        let planner = Planner::new(canonical, &importance, &classes, choices);
+        let mut job = Job { planner, free, directions: importance.directions.as_ref(), layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
+        search::search(&mut job, &self.settings, context)
+    }
     fn motion(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<(Motion, Vec<bool>)> {
         let n = gaussians.len();
         let Some(threshold) = context.dynamic_threshold else { return Ok((Motion { free: 0, moving: None, levels: [0.0; 2] }, vec![false; n])) };
@@ -228,23 +139,7 @@ impl AttributeCodec for Compact {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
         crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
-        let measured = if self.settings.measured {
-            importance::measure(gaussians, context, self.settings.adaptive && self.settings.shapes, self.settings.joint)?
-        } else {
-            None
-        };
-        let mut importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
-        let (motion, free) = self.motion(gaussians, context)?;
-        let canonical = encode::canonical(gaussians, &free);
-        let classes = encode::classify(&importance.weights, &importance.shapes, self.settings.adaptive);
-        if self.settings.measured {
-            importance.attributes = sensitivity::measure(&canonical, &classes, context, search::estimate(self.settings.psnr_db, &importance))?;
-        }
-        let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
-        let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
-        let planner = Planner::new(&canonical, &importance, &classes, choices);
-        let mut job = Job { planner, free, directions: importance.directions.as_ref(), layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
-        let streams = search::search(&mut job, &self.settings, context)?;
+        let streams = self.streams(gaussians, context)?;
         // What cannot be read again is no file.
         self.decode(&streams, &CodecContext::new(context.seed, context.limits, context.events))?;
         Ok(streams)
@@ -263,6 +158,10 @@ impl AttributeCodec for Compact {
     }
     fn keeps_motion(&self) -> bool {
         true
+    }
+    fn check_without_scene(&self) -> Result<()> {
+        self.settings.check_without_tuner()?;
+        self.settings.check_without_views()
     }
     fn most_bytes(&self) -> Option<u64> {
         (self.settings.max_size_mb > 0.0).then_some((1e6 * self.settings.max_size_mb) as u64)
@@ -289,7 +188,10 @@ inventory::submit! {
 
 #[cfg(test)]
 mod tests {
+    use super::joint::Directions;
+    use super::plan::{Bounds, Plan};
     use super::*;
+    use cc4dgs_format::storage::column_loss;
 
     #[test]
     fn the_stored_version_is_that_of_the_plug_in() {
@@ -317,14 +219,14 @@ mod tests {
             directions.add(&cc4dgs_format::Camera::look_at("t", (8, 8), 1.0, eye, [0.0; 3], [0.0, 0.0, 1.0]), &g.means, &vec![1.0; n]);
         }
         let directions = directions.factored();
-        let planner = Planner::new(&g, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
+        let columns = Columns::from(&g);
+        let planner = Planner::new(columns, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
         let (layers, motion) = (layers::assign(&importance.weights, 1), Motion { free: 0, moving: None, levels: [0.0; 2] });
         let job = Job { planner, free: vec![false; n], directions: Some(&directions), layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
         let wanted = job.planner.plan(0.05, &job.factors, &Bounds::NONE);
         let too_much = |plan: &Plan| {
-            let of = job.quantise(&g, plan);
-            let order = job.order(&of);
-            let (sorted, rounded) = (g.select(&order), rounding::restored(&of, &g).select(&order));
+            let order = job.order(&job.quantise(columns, plan, None));
+            let (sorted, rounded) = (g.select(&order), job.restored(columns, plan));
             let losses = sorted.columns().into_iter().zip(rounded.columns()).zip(LOSSES).map(|(((name, width, a), (_, _, b)), loss)| {
                 assert_eq!(name, loss.0);
                 column_loss(name, a, b, width) > loss.1
@@ -333,7 +235,7 @@ mod tests {
         };
         let lost = too_much(&wanted);
         assert!(lost[0] && (lost[4] || lost[5]), "the test has nothing to show: {lost:?}");
-        let kept = job.attempt(0.05).unwrap().plan;
+        let kept = job.attempt(0.05).unwrap().0.plan;
         assert_eq!(too_much(&kept), [false; 7]);
         // Steps of class 0 are as wanted: the others pay.
         assert_eq!((kept.geometry.cell, kept.geometry.scale_step), (wanted.geometry.cell, wanted.geometry.scale_step));

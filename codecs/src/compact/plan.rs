@@ -2,10 +2,11 @@
 
 use super::attributes::Coding;
 use super::colors::{Choices, Degree, Transform};
-use super::encode::{Classes, LOG_SCALE_LIMIT, coefficients};
+use super::columns::Columns;
+use super::encode::{Classes, LOG_SCALE_LIMIT};
 use super::geometry::{GRID_BITS, Geometry};
 use super::importance::{Importance, median};
-use cc4dgs_format::HostGaussians;
+use cc4dgs_format::storage::PartialLoss;
 use rayon::prelude::*;
 
 /// Largest step of a centre, in middle scales, if no [`Bounds`] are set.
@@ -48,7 +49,7 @@ impl Bounds {
 
 /// Plans for canonical Gaussians, and what all of them share.
 pub struct Planner<'a> {
-    pub gaussians: &'a HostGaussians,
+    pub gaussians: Columns<'a>,
     pub importance: &'a Importance,
     pub classes: &'a Classes,
     choices: Choices,
@@ -57,30 +58,34 @@ pub struct Planner<'a> {
     /// Median of the middle log-scales.
     middle: f64,
     /// Sorted coordinates of the centres.
-    axes: [Vec<f64>; 3],
+    axes: [Vec<f32>; 3],
     /// Of each degree.
     transforms: Vec<Transform>,
+    /// Of the higher degrees, before any is rounded.
+    pub rest: PartialLoss,
 }
 
 impl<'a> Planner<'a> {
-    pub fn new(gaussians: &'a HostGaussians, importance: &'a Importance, classes: &'a Classes, choices: Choices) -> Self {
-        let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
-        let middle: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
+    pub fn new(gaussians: Columns<'a>, importance: &'a Importance, classes: &'a Classes, choices: Choices) -> Self {
+        let finite = || gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v));
+        let middles = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2]))));
+        let middle = median(&middles.collect::<Vec<f64>>());
         let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
-        let transform = |degree: usize| Transform::of(&coefficients(gaussians, degree), 3 * (2 * degree + 1), &squared, &choices);
+        let transform = |degree: usize| Transform::of(gaussians.coefficients(degree), &squared, &choices);
         Self {
             gaussians,
             importance,
             classes,
             choices,
-            scale_origin: (finite.iter().sum::<f64>() / finite.len().max(1) as f64) as f32,
-            middle: median(&middle),
-            axes: sorted_axes(&gaussians.means),
+            scale_origin: (finite().sum::<f64>() / finite().count().max(1) as f64) as f32,
+            middle,
+            axes: sorted_axes(gaussians.means),
             transforms: (0..=gaussians.sh_degree).map(transform).collect(),
+            rest: PartialLoss::new(gaussians.sh_rest),
         }
     }
     /// Plans for other Gaussians of the same importance.
-    pub fn of<'b>(&self, gaussians: &'b HostGaussians) -> Planner<'b>
+    pub fn of<'b>(&self, gaussians: Columns<'b>) -> Planner<'b>
     where
         'a: 'b,
     {
@@ -116,16 +121,16 @@ impl<'a> Planner<'a> {
 }
 
 /// The coordinates of centres `[N,3]`, sorted along each axis.
-fn sorted_axes(means: &[f32]) -> [Vec<f64>; 3] {
-    let mut axes: [Vec<f64>; 3] = std::array::from_fn(|k| means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).collect());
-    axes.iter_mut().for_each(|axis| axis.par_sort_unstable_by(f64::total_cmp));
+fn sorted_axes(means: &[f32]) -> [Vec<f32>; 3] {
+    let mut axes: [Vec<f32>; 3] = std::array::from_fn(|k| means.iter().skip(k).step_by(3).copied().collect());
+    axes.iter_mut().for_each(|axis| axis.par_sort_unstable_by(f32::total_cmp));
     axes
 }
 
 /// Chooses the grid of the centres, whose sorted coordinates are `axes`: `relative` is the step of class 0 over the middle scale, `largest` that of the coarsest
 /// class; the logarithm of the middle scale has the median `middle`. A grid of so many cells may be too small for them; then some are left out, or cells are
 /// larger than wanted, and steps of larger Gaussians and coarser classes are doubled less often.
-fn grid(geometry: &mut Geometry, axes: &[Vec<f64>; 3], middle: f64, pixels_per_unit: f64, (relative, largest): (f64, f64)) {
+fn grid(geometry: &mut Geometry, axes: &[Vec<f32>; 3], middle: f64, pixels_per_unit: f64, (relative, largest): (f64, f64)) {
     let relative = relative.min(0.5).min(largest).max(1e-9);
     // Below half a pixel all Gaussians look alike.
     let pixel = if pixels_per_unit > 0.0 { libm::log(0.5 / pixels_per_unit) } else { -60.0 };
@@ -149,11 +154,11 @@ fn grid(geometry: &mut Geometry, axes: &[Vec<f64>; 3], middle: f64, pixels_per_u
 }
 
 /// What is left of sorted values without the share `cut` at either end.
-fn span(sorted: &[f64], cut: f64) -> [f64; 2] {
+fn span(sorted: &[f32], cut: f64) -> [f64; 2] {
     let last = sorted.len().saturating_sub(1);
     let skip = (cut * sorted.len() as f64).ceil() as usize;
     match sorted.get(skip.min(last)).zip(sorted.get(last.saturating_sub(skip))) {
-        Some((&low, &high)) if low <= high => [low, high],
+        Some((&low, &high)) if low <= high => [f64::from(low), f64::from(high)],
         _ => [0.0; 2],
     }
 }

@@ -124,21 +124,21 @@ impl Linear {
     pub const fn contexts(dims: usize) -> usize {
         dims * LEVELS
     }
-    /// Fits the weights to the rows `codes` `[N,dims]`. Blocks start where they would in one layer; that layers and lanes start anew matters
-    /// little.
-    pub fn fit(dims: usize, codes: &[i32], known: &[Known]) -> Self {
+    /// Fits the weights to the rows `codes` `[N,dims]`, where so much is `known` about each. Blocks start where they would in one layer; that layers and lanes
+    /// start anew matters little.
+    pub fn fit(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known) -> Self {
         let mut fitted = vec![[0.0; INPUTS]; dims];
         let mut spread = [0.0; DIMS];
         for pass in 0..PASSES {
             let mut sums = vec![([[0.0f64; INPUTS]; INPUTS], [0.0f64; INPUTS]); dims];
             let (mut errors, mut history) = ([0.0; DIMS], History::new());
-            for (i, (codes, known)) in codes.chunks_exact(dims).zip(known).enumerate() {
+            for (i, codes) in codes.chunks_exact(dims).enumerate() {
                 if i % super::blocks::ROWS == 0 {
                     history = History::new();
                 }
-                let mut row = [0; DIMS];
+                let (mut row, known) = ([0; DIMS], known(i));
                 for (c, &code) in codes.iter().enumerate() {
-                    let inputs = history.inputs(c, &row, known).map(|v| v as f64);
+                    let inputs = history.inputs(c, &row, &known).map(|v| v as f64);
                     row[c] = i64::from(code) << known.shift;
                     let target = row[c] as f64;
                     let error = (target - fitted[c].iter().zip(inputs).map(|(w, x)| w * x).sum::<f64>()).abs();
@@ -152,7 +152,7 @@ impl Linear {
                 }
                 history.push(row);
             }
-            spread = errors.map(|e| 0.5 * e / known.len().max(1) as f64);
+            spread = errors.map(|e| 0.5 * e / (codes.len() / dims).max(1) as f64);
             for ((matrix, vector), fitted) in sums.into_iter().zip(&mut fitted) {
                 *fitted = solve(matrix, vector);
             }
@@ -161,15 +161,15 @@ impl Linear {
         Self { dims, weights: fitted.into_iter().flatten().map(round).collect() }
     }
     /// Predictions of the rows `codes` `[N,dims]`, in the steps of each row. Lanes, in which coders start anew, are left out.
-    pub fn guesses(&self, codes: &[i32], known: &[Known]) -> Vec<f64> {
+    pub fn guesses(&self, codes: &[i32], known: impl Fn(usize) -> Known) -> Vec<f64> {
         let (mut out, mut history) = (Vec::with_capacity(codes.len()), History::new());
-        for (i, (codes, known)) in codes.chunks_exact(self.dims).zip(known).enumerate() {
+        for (i, codes) in codes.chunks_exact(self.dims).enumerate() {
             if i % super::blocks::ROWS == 0 {
                 history = History::new();
             }
-            let mut row = [0; DIMS];
+            let (mut row, known) = ([0; DIMS], known(i));
             for (c, (&code, weights)) in codes.iter().zip(self.weights.chunks_exact(INPUTS)).enumerate() {
-                let sum: f64 = history.inputs(c, &row, known).into_iter().zip(weights).map(|(x, &w)| x as f64 * f64::from(w)).sum();
+                let sum: f64 = history.inputs(c, &row, &known).into_iter().zip(weights).map(|(x, &w)| x as f64 * f64::from(w)).sum();
                 out.push(sum / f64::from(1u32 << POINT) / f64::from(1u32 << known.shift.min(15)));
                 row[c] = i64::from(code) << known.shift;
             }
@@ -293,7 +293,7 @@ mod tests {
     fn what_follows_from_the_rest_has_no_error() {
         let known: Vec<Known> = (0..3000i64).map(|i| Known { classes: [(i % 7) as u8, 0], given: [i * i % 977, i % 13, 0], ..Default::default() }).collect();
         let codes: Vec<i32> = known.iter().map(|k| (3 * k.given[0] - 7 * k.given[1]) as i32 + 5 * i32::from(k.classes[0])).collect();
-        let linear = Linear::fit(1, &codes, &known);
+        let linear = Linear::fit(1, &codes, |i| known[i]);
         let mut encoder = super::super::entropy::Encoder::default();
         linear.code(&mut encoder, &mut codes.clone(), &known).unwrap();
         let (tables, stored) = super::super::entropy::Tables::fit(Linear::contexts(1), std::slice::from_ref(&encoder));

@@ -1,14 +1,16 @@
 //! Gaussians as they will be decoded, and what their values cost, without coding them. Fine-tuning asks for both in every iteration.
 
 use super::colors::slope;
-use super::encode::{Classes, Integers, coefficients};
+use super::columns::Columns;
+use super::encode::{Classes, Integers};
 use super::geometry::companded;
 use super::plan::Plan;
 use super::predict::{Known, Linear};
+use super::restore::restored;
 use super::write::{known_classes, known_scales};
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::{HostGaussians, Result, Rounding};
-use rayon::prelude::*;
+use std::ops::Range;
 
 /// Largest step of a unit quaternion's component that [`Rounding::steps`] tells: with larger ones all rotations are rounded alike.
 const LARGEST_TURN: f64 = 0.25;
@@ -22,10 +24,10 @@ pub struct Rounder<'a> {
 
 impl Rounding for Rounder<'_> {
     fn round(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        Ok(restored(&self.plan.quantise(gaussians, self.free, self.classes, None), gaussians))
+        Ok(restored(&self.codes(gaussians), gaussians.into()))
     }
     fn steps(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        let codes = self.plan.quantise(gaussians, self.free, self.classes, None);
+        let codes = self.codes(gaussians);
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let mut out = zeros_like(gaussians);
         for (i, &shape) in shapes.iter().enumerate() {
@@ -41,12 +43,12 @@ impl Rounding for Rounder<'_> {
             let steps: Vec<f32> = self.classes.colors.iter().flat_map(|&class| std::iter::repeat_n(plan.step_of(class) as f32, plan.dims)).collect();
             set_coefficients(&mut out, degree, &steps);
         }
-        keep_exact(&codes, &zeros_like(gaussians), &mut out);
+        clear_exact(&codes, &mut out);
         out.extra = codes.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.steps())).collect();
         Ok(out)
     }
     fn bit_slopes(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        let codes = self.plan.quantise(gaussians, self.free, self.classes, None);
+        let codes = self.codes(gaussians);
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let mut out = zeros_like(gaussians);
         for (i, &shape) in shapes.iter().enumerate() {
@@ -70,9 +72,9 @@ impl Rounding for Rounder<'_> {
         }
         for (degree, plan) in self.plan.degrees.iter().enumerate() {
             let guesses = (degree == 0).then_some(guesses.colors.as_slice());
-            set_coefficients(&mut out, degree, &plan.bit_slopes(&coefficients(gaussians, degree), &self.classes.colors, guesses));
+            set_coefficients(&mut out, degree, &plan.bit_slopes(Columns::from(gaussians).coefficients(degree), &self.classes.colors, guesses));
         }
-        keep_exact(&codes, &zeros_like(gaussians), &mut out);
+        clear_exact(&codes, &mut out);
         for coded in &codes.attributes {
             if let Some(attribute) = gaussians.extra.get(&coded.coding.name) {
                 out.extra.insert(coded.coding.name.clone(), coded.bit_slopes(&attribute.values, &order, self.classes));
@@ -92,13 +94,17 @@ struct Guesses {
 }
 
 impl Rounder<'_> {
+    fn codes(&self, gaussians: &HostGaussians) -> Integers<'_> {
+        let colors = self.plan.color_codes(gaussians.into(), self.classes, None, None);
+        self.plan.quantise(gaussians.into(), self.free, self.classes, colors)
+    }
     /// The predictions of `codes`, whose rows are coded in `order`.
     fn guesses(&self, codes: &Integers, order: &[usize]) -> Guesses {
         let (geometry, classes) = (&self.plan.geometry, self.classes);
         let guesses = |dims: usize, values: &[i32], known: &dyn Fn(usize) -> Known| {
             let sorted: Vec<i32> = order.iter().flat_map(|&i| &values[i * dims..(i + 1) * dims]).copied().collect();
-            let known: Vec<Known> = order.iter().map(|&i| known(i)).collect();
-            let found = Linear::fit(dims, &sorted, &known).guesses(&sorted, &known);
+            let known = |row: usize| known(order[row]);
+            let found = Linear::fit(dims, &sorted, known).guesses(&sorted, known);
             let mut out = vec![0.0; values.len()];
             order.iter().zip(found.chunks_exact(dims)).for_each(|(&i, row)| out[i * dims..(i + 1) * dims].copy_from_slice(row));
             out
@@ -107,7 +113,7 @@ impl Rounder<'_> {
         Guesses {
             scales: guesses(3, codes.scales.as_flattened(), &|i| known_classes(of(i).0, of(i).1, false, geometry.scale_limit)),
             opacities: guesses(1, &codes.opacities, &|i| known_scales(of(i).0, of(i).1, &codes.scales[i], geometry.scale_limit, geometry.opacity_limit)),
-            colors: guesses(3, &codes.colors[0], &|i| known_classes(of(i).0, of(i).1, true, 15)),
+            colors: guesses(3, &codes.colors[0].values, &|i| known_classes(of(i).0, of(i).1, true, 15)),
         }
     }
 }
@@ -117,32 +123,6 @@ fn by_key(codes: &Integers) -> Vec<usize> {
     let mut order: Vec<usize> = (0..codes.keys.len()).collect();
     order.sort_by_key(|&i| (codes.keys[i], i));
     order
-}
-
-/// What the integers of `gaussians` stand for, in the same order.
-pub fn restored(codes: &Integers, gaussians: &HostGaussians) -> HostGaussians {
-    let (plan, classes) = (codes.plan, codes.classes);
-    let (geometry, shapes) = (&plan.geometry, &classes.shapes);
-    let mut out = gaussians.clone();
-    let centres = out.means.par_chunks_exact_mut(3).zip(out.log_scales.par_chunks_exact_mut(3));
-    let rows = centres.zip(out.quaternions.par_chunks_exact_mut(4)).zip(out.opacity_logits.par_iter_mut()).enumerate();
-    rows.for_each(|(i, (((mean, log_scales), quaternion), opacity))| {
-        let (scales, shape) = (codes.scales[i], shapes[i]);
-        log_scales.iter_mut().zip(scales).for_each(|(out, code)| *out = geometry.scale(code, shape));
-        mean.copy_from_slice(&geometry.centre(codes.keys[i], geometry.position_shift(scales, shape)));
-        quaternion.copy_from_slice(&codes.rotations[i].quaternion(geometry.rotation(geometry.rotation_shift(scales, shape))));
-        *opacity = geometry.opacity(codes.opacities[i], shape);
-    });
-    for (degree, (plan, codes)) in plan.degrees.iter().zip(&codes.colors).enumerate() {
-        let basis = plan.scaled_basis();
-        let mut rows = vec![0.0; codes.len()];
-        let each = rows.par_chunks_exact_mut(plan.dims).zip(codes.par_chunks_exact(plan.dims)).zip(&classes.colors);
-        each.for_each(|((row, codes), &class)| plan.restore(&basis, codes, class, row));
-        set_coefficients(&mut out, degree, &rows);
-    }
-    keep_exact(codes, gaussians, &mut out);
-    out.extra.extend(codes.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.restored())));
-    out
 }
 
 /// Zeros in the shape of `gaussians`, without attributes of plug-ins.
@@ -164,28 +144,27 @@ fn set_coefficients(gaussians: &mut HostGaussians, degree: usize, rows: &[f32]) 
     }
 }
 
-/// Copies what is stored exactly from `from`.
-fn keep_exact(codes: &Integers, from: &HostGaussians, to: &mut HostGaussians) {
-    let rest = 3 * sh_rest_len(from.sh_degree);
-    let copy = |rows: &[usize], width: usize, at: std::ops::Range<usize>, from: &[f32], to: &mut [f32]| {
-        for row in rows {
-            let range = row * width + at.start..row * width + at.end;
-            to[range.clone()].copy_from_slice(&from[range]);
-        }
+/// Zeros where values are stored exactly.
+fn clear_exact(codes: &Integers, out: &mut HostGaussians) {
+    let rest = 3 * sh_rest_len(out.sh_degree);
+    let clear = |rows: &[usize], width: usize, at: Range<usize>, values: &mut [f32]| {
+        rows.iter().for_each(|row| values[row * width + at.start..row * width + at.end].fill(0.0));
     };
-    copy(&codes.exact[0], 3, 0..3, &from.means, &mut to.means);
-    copy(&codes.exact[1], 3, 0..3, &from.log_scales, &mut to.log_scales);
-    copy(&codes.exact[2], 4, 0..4, &from.quaternions, &mut to.quaternions);
-    copy(&codes.exact[3], 1, 0..1, &from.opacity_logits, &mut to.opacity_logits);
-    copy(&codes.exact[4], 3, 0..3, &from.sh_dc, &mut to.sh_dc);
-    for (degree, rows) in codes.exact.iter().skip(5).enumerate().map(|(d, rows)| (d + 1, rows)) {
-        copy(rows, rest, 3 * (degree * degree - 1)..3 * ((degree + 1) * (degree + 1) - 1), &from.sh_rest, &mut to.sh_rest);
+    clear(&codes.exact[0], 3, 0..3, &mut out.means);
+    clear(&codes.exact[1], 3, 0..3, &mut out.log_scales);
+    clear(&codes.exact[2], 4, 0..4, &mut out.quaternions);
+    clear(&codes.exact[3], 1, 0..1, &mut out.opacity_logits);
+    clear(&codes.colors[0].missing, 3, 0..3, &mut out.sh_dc);
+    for (degree, codes) in codes.colors.iter().enumerate().skip(1) {
+        clear(&codes.missing, rest, 3 * sh_rest_len(degree - 1)..3 * sh_rest_len(degree), &mut out.sh_rest);
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::encode::{canonical, classify};
+    use super::super::colors::{Degree, Transform};
+    use super::super::columns::Rows;
+    use super::super::encode::{classify, make_canonical};
     use super::super::plan::{Bounds, Planner};
     use super::super::sensitivity::{Growth, Sensitivity};
     use super::super::{Choices, Job, Motion, importance, layers, read};
@@ -212,18 +191,20 @@ mod tests {
         let limits = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
         for free in [false, true] {
             let free = vec![free; 300];
-            let g = canonical(&scene(300), &free);
+            let mut g = scene(300);
+            make_canonical(&mut g.log_scales, &mut g.quaternions, &free);
             let mut importance = importance::estimate(&g, &limits);
             importance.attributes = vec![Sensitivity { name: "a".into(), growth: Growth::None, weight: 30.0 }];
             let classes = classify(&importance.weights, &importance.shapes, true);
             let motion = Motion { free: u8::from(free[0]), moving: None, levels: [0.0; 2] };
             let layers = layers::assign(&importance.weights, 2);
             let choices = Choices { transform: true, rate_weight: 0.0 };
-            let planner = Planner::new(&g, &importance, &classes, choices);
+            let columns = Columns::from(&g);
+            let planner = Planner::new(columns, &importance, &classes, choices);
             let job = Job { planner, free, directions: None, layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
             let plan = job.planner.plan(0.02, &[1.0; 6], &Bounds::NONE);
-            let order = job.order(&job.quantise(&g, &plan));
-            let decoded = read::read(&job.streams(&g, &plan).unwrap(), &limits, true).unwrap();
+            let order = job.order(&job.quantise(columns, &plan, None));
+            let decoded = read::read(&job.streams(columns, &plan).unwrap(), &limits, true).unwrap();
             let rounder = Rounder { plan: &plan, free: &job.free, classes: &classes };
             let rounded = rounder.round(&g).unwrap();
             let (found, steps) = (rounded.select(&order), rounder.steps(&g).unwrap());
@@ -246,13 +227,10 @@ mod tests {
     #[test]
     fn slopes_are_derivatives_of_bits() {
         let g = scene(40);
-        let (rows, classes) = (coefficients(&g, 2), vec![1u8; 40]);
-        let plan = super::super::colors::Degree::plan(
-            &super::super::colors::Transform::of(&rows, 15, &[1.0; 40], &Choices { transform: true, rate_weight: 0.0 }),
-            0.2,
-        );
+        let (rows, classes): (Vec<f32>, _) = (Columns::from(&g).coefficients(2).iter().flatten().copied().collect(), vec![1u8; 40]);
+        let plan = Degree::plan(&Transform::of(Rows::of(&rows, 15), &[1.0; 40], &Choices { transform: true, rate_weight: 0.0 }), 0.2);
         let guesses: Vec<f64> = (0..rows.len()).map(|k| (k as f64 * 0.7).sin()).collect();
-        let slopes = plan.bit_slopes(&rows, &classes, Some(&guesses));
+        let slopes = plan.bit_slopes(Rows::of(&rows, 15), &classes, Some(&guesses));
         for k in [0, 7, 100, 599] {
             let bits = |by: f32| {
                 let mut rows = rows.clone();

@@ -1,20 +1,22 @@
 //! The search for the quality: the step factor that uses up an allowed loss or size.
 
 use super::importance::{Importance, budget};
+use super::job::{Attempt, Job};
 use super::settings::Settings;
 use super::tune::{self, Goal, Tuned, Untuned};
-use super::{Attempt, Job, allocate, bytes_of};
-use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, Stream, TrainingViews, WeightArray, psnr_on_views};
+use super::{allocate, bytes_of};
+use cc4dgs_format::{CodecContext, Error, Event, HostGaussians, RenderModel, Result, Stream, TrainingViews, WeightArray, psnr_on_views};
 use std::ops::RangeInclusive;
 
-/// Views on which the loss is measured, by [`budget`].
+/// Views that judge ([`CodecContext::judging_views`]) on which the loss is measured, by [`budget`].
 const VIEWS: RangeInclusive<usize> = 8..=16;
 const WORK: usize = 3_000_000;
 /// Attempts of a search, at most.
 const ATTEMPTS: usize = 8;
 /// Parameters of a Gaussian that are not rounded to zero, for the estimate of the error.
 const PARAMETERS: f64 = 20.0;
-/// Shares of an allowance that are good enough: before the steps of the columns are corrected, and at the end.
+/// Shares of an allowance that are good enough: before the steps of the columns are corrected, and at the end. A search that ends with less than the first is
+/// warned of.
 const ROUGH: f64 = 0.8;
 const GOOD: f64 = 0.97;
 /// The share that attempts aim at.
@@ -37,8 +39,8 @@ pub fn estimate(psnr_db: f64, importance: &Importance) -> f64 {
 enum Allowance<'a> {
     /// Bytes of the file ([`file_bytes`]). Larger steps use fewer.
     Bytes { limit: f64, context: &'a CodecContext<'a> },
-    /// PSNR on the views, in dB below `before`. Larger steps lose more.
-    Drop { before: f64, limit: f64, views: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize },
+    /// PSNR on the views that judge, in dB below `before`. Larger steps lose more.
+    Drop { before: f64, limit: f64, judges: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize },
 }
 
 impl Allowance<'_> {
@@ -46,21 +48,21 @@ impl Allowance<'_> {
     fn tried(&self, job: &Job, quality: f64) -> Result<Tried> {
         match self {
             Self::Bytes { limit, context } => {
-                let (attempt, streams) = job.coded_attempt(&job.planner, quality, &job.factors)?;
-                Ok(Tried { attempt, share: file_bytes(context, &streams, None)? / limit, streams: Some(streams) })
+                let (attempt, streams) = job.coded(&job.planner, quality, &job.factors)?;
+                Ok(Tried { attempt, share: file_bytes(context, &streams, None)? / limit, streams: Some(streams), last: false })
             }
-            Self::Drop { before, limit, views, renderer, chosen } => {
-                let attempt = job.attempt(quality)?;
-                let share = (before - psnr_on_views(&attempt.rounded, *views, *renderer, *chosen)?) / limit;
-                Ok(Tried { attempt, share, streams: None })
+            Self::Drop { before, limit, judges, renderer, chosen } => {
+                let (attempt, rounded) = job.attempt(quality)?;
+                let share = (before - psnr_on_views(&rounded, *judges, *renderer, *chosen)?) / limit;
+                Ok(Tried { attempt, share, streams: None, last: false })
             }
         }
     }
-    /// Octaves from the step factor of an attempt to the one that is expected to use [`AIM`].
-    fn octaves(&self, attempt: &Attempt, share: f64) -> f64 {
+    /// Octaves from the step factor of an attempt with so many Gaussians to the one that is expected to use [`AIM`].
+    fn octaves(&self, gaussians: usize, share: f64) -> f64 {
         match self {
             // An octave of all steps is a bit of every value that is not zero.
-            Self::Bytes { limit, .. } => (share - AIM) * limit / (PARAMETERS / 8.0 * attempt.rounded.len().max(1) as f64),
+            Self::Bytes { limit, .. } => (share - AIM) * limit / (PARAMETERS / 8.0 * gaussians.max(1) as f64),
             // Squared errors of images, small beside what a model leaves, add to the loss in proportion.
             Self::Drop { .. } => 0.5 * libm::log2(AIM / share.max(LEAST)),
         }
@@ -77,6 +79,8 @@ struct Tried {
     share: f64,
     /// Where it was coded.
     streams: Option<Vec<Stream>>,
+    /// Whether no attempt was left when it was chosen, and none was good enough.
+    last: bool,
 }
 
 impl Tried {
@@ -89,15 +93,16 @@ impl Tried {
 }
 
 /// The attempt that uses most of what is allowed, from the step factor `start`; the one that uses least if none is allowed. A share of `good` ends the search.
-fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried> {
+/// `first` is the attempt at `start`, where it has been made before.
+fn seek(job: &Job, start: f64, mut first: Option<Tried>, allowance: &Allowance, good: f64) -> Result<Tried> {
     let direction = allowance.direction();
     // Octaves over `start` in the direction in which more is used.
     let (mut at, mut refused) = (0.0, f64::INFINITY);
     let mut best: Option<(f64, Tried)> = None;
     let mut least = None;
     for _ in 0..ATTEMPTS {
-        let tried = allowance.tried(job, start * libm::exp2(direction * at))?;
-        let step = direction * allowance.octaves(&tried.attempt, tried.share);
+        let tried = first.take().map_or_else(|| allowance.tried(job, start * libm::exp2(direction * at)), Ok)?;
+        let step = direction * allowance.octaves(job.planner.gaussians.len(), tried.share);
         if tried.allowed() {
             if tried.share >= good {
                 return Ok(tried);
@@ -120,7 +125,7 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
         };
     }
     match best.map(|(_, tried)| tried).or(least) {
-        Some(tried) => Ok(tried),
+        Some(tried) => Ok(Tried { last: true, ..tried }),
         None => Err(Error::backend("codec compact", "no step factor was tried", "Report this")),
     }
 }
@@ -129,27 +134,28 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
 pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Result<Vec<Stream>> {
     let (gaussians, start) = (job.planner.gaussians, estimate(settings.psnr_db, job.planner.importance));
     let object = "codec compact";
-    if settings.finetune_wanted && settings.finetune > 0 && context.tuner.is_none() && !gaussians.is_empty() {
-        let problem = "fine-tuning needs the training views, and there are none";
-        return Err(Error::parameter("codec compact.finetune", problem, "Give the dataset with --scene, or leave it out"));
+    if context.tuner.is_none() && !gaussians.is_empty() {
+        settings.check_without_tuner()?;
     }
     let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !gaussians.is_empty());
+    if services.is_none() && !gaussians.is_empty() {
+        settings.check_without_views()?;
+    }
+    let by_size = settings.max_size_mb > 0.0;
+    if !by_size && (services.is_none() || settings.max_drop_db <= 0.0) {
+        return Ok(job.coded(&job.planner, start, &job.factors)?.1);
+    }
+    // Images are drawn of whole Gaussians.
+    let whole = services.map(|_| gaussians.to_host());
+    let services = services.zip(whole.as_ref());
     let allowance = match services {
-        _ if settings.max_size_mb > 0.0 => Allowance::Bytes { limit: bytes_of_file(settings, context)?, context },
-        None if settings.drop_wanted && !gaussians.is_empty() => {
-            let problem = "a loss of PSNR is measured on training views, and there are none";
-            return Err(Error::parameter(object, problem, "Give the dataset with --scene, or choose compact:psnr=50dB or compact:max-size=5MB"));
+        Some(((views, renderer), whole)) if !by_size => {
+            let judges = context.judging_views().unwrap_or(views);
+            let chosen = judges.len().min(budget(WORK, gaussians.len(), VIEWS));
+            let before = psnr_on_views(whole, judges, renderer, chosen)?;
+            Allowance::Drop { before, limit: settings.max_drop_db, judges, renderer, chosen }
         }
-        Some((views, renderer)) if settings.max_drop_db > 0.0 => {
-            let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
-            let before = psnr_on_views(gaussians, views, renderer, chosen)?;
-            Allowance::Drop { before, limit: settings.max_drop_db, views, renderer, chosen }
-        }
-        _ if settings.finetune_wanted && settings.finetune > 0 && !gaussians.is_empty() => {
-            let problem = "fine-tuning belongs to the search for a loss or a size, and neither is bounded";
-            return Err(Error::parameter("codec compact.finetune", problem, "Choose compact:max-drop=0.05dB or compact:max-size=5MB, or leave it out"));
-        }
-        _ => return Ok(job.coded_attempt(&job.planner, start, &job.factors)?.1),
+        _ => Allowance::Bytes { limit: bytes_of_file(settings, context)?, context },
     };
     let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
     let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();
@@ -164,16 +170,18 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         job.directions = None;
     }
     let corrected = services.filter(|_| settings.allocate);
-    let mut found = seek(job, start, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
+    let mut found = seek(job, start, None, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
     let mut streams = found.coded(job)?;
-    if let Some((views, renderer)) = corrected {
+    if let Some(((views, renderer), whole)) = corrected {
         let plain = job.factors;
         // Where a size is allowed, more is lost before fine-tuning than after it.
         let fewer = tuner.is_some() && matches!(allowance, Allowance::Bytes { .. });
-        let quality = found.attempt.quality * if fewer { fine(job, &found.attempt, views, renderer)? } else { 1.0 };
-        job.factors = allocate::allocate(job, quality, views, renderer)?;
+        let judges = context.judging_views().unwrap_or(views);
+        let quality = found.attempt.quality * if fewer { fine(job, &found.attempt, whole, judges, renderer)? } else { 1.0 };
+        let known = job.repeats(&found.attempt, quality, &[1.0; 6]).then(|| (&found.attempt.plan, bytes_of(&streams)));
+        job.factors = allocate::allocate(job, quality, known, whole, views, renderer)?;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
-        let mut second = seek(job, found.attempt.quality, &allowance, GOOD)?;
+        let mut second = seek(job, found.attempt.quality, None, &allowance, GOOD)?;
         let coded = second.coded(job)?;
         // The corrections may be worth nothing in small models.
         let worse = matches!(allowance, Allowance::Drop { .. }) && bytes_of(&coded) >= bytes_of(&streams);
@@ -181,7 +189,9 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             job.factors = plain;
             // It was good enough to be corrected.
             if found.share < GOOD {
-                found = seek(job, found.attempt.quality, &allowance, GOOD)?;
+                let start = found.attempt.quality;
+                let first = Some(found).filter(|found| job.repeats(&found.attempt, start, &plain));
+                found = seek(job, start, first, &allowance, GOOD)?;
                 streams = found.coded(job)?;
             }
         } else {
@@ -205,10 +215,11 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
                 // Training was what colours were rounded apart for.
                 if directions.is_some() {
                     job.directions = directions;
-                    let mut joint = seek(job, found.attempt.quality, &allowance, GOOD)?;
+                    let mut joint = seek(job, found.attempt.quality, None, &allowance, GOOD)?;
                     let coded = joint.coded(job)?;
                     if let Goal::Drop(limit) = goal {
-                        joint.share = joint.share.max(tune::loss(tuner, gaussians, &joint.attempt.rounded)? / limit);
+                        let rounded = job.restored(gaussians, &joint.attempt.plan);
+                        joint.share = joint.share.max(tune::loss(tuner, gaussians, &rounded)? / limit);
                     }
                     let better = match (joint.allowed(), found.allowed()) {
                         // In the same bytes, colours that are rounded together are nearer.
@@ -228,9 +239,10 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
 }
 
 /// A factor of the steps of `attempt` with which about [`TUNED`] is lost; 1 if less is lost already.
-fn fine(job: &Job, attempt: &Attempt, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<f64> {
-    let chosen = views.len().min(budget(WORK, attempt.rounded.len(), VIEWS));
-    let lost = psnr_on_views(job.planner.gaussians, views, renderer, chosen)? - psnr_on_views(&attempt.rounded, views, renderer, chosen)?;
+fn fine(job: &Job, attempt: &Attempt, whole: &HostGaussians, judges: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<f64> {
+    let chosen = judges.len().min(budget(WORK, whole.len(), VIEWS));
+    let rounded = job.restored(job.planner.gaussians, &attempt.plan);
+    let lost = psnr_on_views(whole, judges, renderer, chosen)? - psnr_on_views(&rounded, judges, renderer, chosen)?;
     Ok(if lost > TUNED { (TUNED / lost).sqrt() } else { 1.0 })
 }
 
@@ -250,10 +262,16 @@ fn bytes_of_file(settings: &Settings, context: &CodecContext) -> Result<f64> {
     Err(Error::parameter("codec compact.max_size_mb", problem, "Allow more, or store the weights in fewer bits, such as --field-weights compact:bits=6"))
 }
 
-/// Says what was chosen, whose Gaussians take so many `bytes`; a loss or size over what the user allowed is an error.
+/// Says what was chosen, whose Gaussians take so many `bytes`, and whether attempts were left; a loss or size over what the user allowed is an error.
 fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settings: &Settings, context: &CodecContext) -> Result<()> {
     let object = "codec compact";
     let (megabytes, steps) = (bytes as f64 / 1e6, found.attempt.quality / start);
+    let ended = if found.last { format!("; the search ended after {ATTEMPTS} attempts") } else { String::new() };
+    if found.last && found.allowed() && found.share < ROUGH {
+        let used = format!("the search ended after {ATTEMPTS} attempts and uses {:.0} % of what is allowed", 100.0 * found.share.max(0.0));
+        let message = format!("{used}: there may be a better file, which a bound that is a little different may find");
+        context.events.emit(&Event::Warning { object: object.into(), message });
+    }
     match allowance {
         Allowance::Bytes { limit, .. } if !found.allowed() => {
             let problem = format!("the smallest file it reached has {:.0} bytes, {bytes} of them of Gaussians", found.share * limit);
@@ -261,15 +279,16 @@ fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settin
         }
         Allowance::Bytes { limit, .. } => {
             let file = found.share * limit / 1e6;
+            let allowed = settings.max_size_mb;
             note(
                 context,
-                format!("{megabytes:.4} MB of Gaussians, {file:.4} MB in all ({} MB allowed), steps {steps:.3} times the estimated ones", settings.max_size_mb),
+                format!("{megabytes:.4} MB of Gaussians, {file:.4} MB in all ({allowed} MB allowed), steps {steps:.3} times the estimated ones{ended}"),
             );
         }
-        Allowance::Drop { limit, chosen, .. } => {
-            let drop = found.share * limit;
+        Allowance::Drop { limit, judges, chosen, .. } => {
+            let (drop, kind) = (found.share * limit, judges.kind());
             if !found.allowed() {
-                let problem = format!("the best of all attempts loses {drop:.3} dB on training views, {limit} dB are allowed");
+                let problem = format!("the best of all attempts loses {drop:.3} dB on {kind} views, {limit} dB are allowed");
                 if settings.drop_wanted {
                     let remedy = "Allow more, store the deformer's weights in more bits, give more iterations of fine-tuning, or choose compact:psnr=70dB";
                     return Err(Error::parameter(object, problem, remedy));
@@ -279,7 +298,7 @@ fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settin
             note(
                 context,
                 format!(
-                    "{megabytes:.4} MB of Gaussians, PSNR {drop:.3} dB lower on {chosen} training views ({limit} dB allowed), steps {steps:.3} times the estimated ones"
+                    "{megabytes:.4} MB of Gaussians, PSNR {drop:.3} dB lower on {chosen} {kind} views ({limit} dB allowed), steps {steps:.3} times the estimated ones{ended}"
                 ),
             );
         }

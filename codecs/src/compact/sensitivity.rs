@@ -1,8 +1,10 @@
 //! How much errors of the attributes of plug-ins change images, measured by changing them.
 
+use super::columns::Columns;
 use super::encode::Classes;
+use super::images::Images;
 use super::importance::{budget, median};
-use cc4dgs_format::{CodecContext, ExtraAttribute, HostGaussians, Result};
+use cc4dgs_format::{CodecContext, ExtraAttribute, Result};
 use std::ops::RangeInclusive;
 
 /// Views on which errors are measured, by [`budget`].
@@ -61,15 +63,11 @@ pub fn moments(attribute: &ExtraAttribute, rows: &[bool]) -> (Vec<f32>, f64) {
 }
 
 /// Measures the attributes of canonical Gaussians at about the step factor `quality`; empty where the context cannot render them.
-pub fn measure(gaussians: &HostGaussians, classes: &Classes, context: &CodecContext, quality: f64) -> Result<Vec<Sensitivity>> {
+pub fn measure(gaussians: Columns, classes: &Classes, context: &CodecContext, quality: f64) -> Result<Vec<Sensitivity>> {
     let services = context.views.zip(context.renderer).filter(|(views, _)| !views.is_empty() && context.deformer.is_some());
     let Some((views, renderer)) = services.filter(|_| !gaussians.is_empty() && !gaussians.extra.is_empty()) else { return Ok(Vec::new()) };
-    let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
-    let draw = |gaussians: &HostGaussians, k: usize| {
-        let (camera, time_norm) = views.view(k * views.len() / chosen);
-        renderer.render(gaussians, camera, time_norm).map(|drawn| (3 * drawn.width as usize * drawn.height as usize, drawn.planes))
-    };
-    let originals = (0..chosen).map(|k| Ok(draw(gaussians, k)?.1)).collect::<Result<Vec<Vec<f32>>>>()?;
+    let gaussians = gaussians.to_host();
+    let images = Images::of(&gaussians, views, renderer, views.len().min(budget(WORK, gaussians.len(), VIEWS)))?;
     let middles: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
     let mut out = Vec::new();
     for (name, attribute) in gaussians.extra.iter().filter(|(_, attribute)| attribute.width > 0) {
@@ -91,12 +89,7 @@ pub fn measure(gaussians: &HostGaussians, classes: &Classes, context: &CodecCont
                     sum += (by / unit).powi(2);
                 }
             }
-            let mut error = 0.0;
-            for (k, original) in originals.iter().enumerate() {
-                let (colours, planes) = draw(&changed, k)?;
-                error += original.iter().zip(&planes).take(colours).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
-            }
-            let squared = error / (chosen as f64 * sum);
+            let squared = images.error(&changed)? / (images.len() as f64 * sum);
             Ok(if squared.is_finite() { squared.sqrt() } else { 0.0 })
         };
         let mut best: Option<(f64, Sensitivity, Vec<f64>)> = None;

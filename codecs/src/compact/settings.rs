@@ -5,7 +5,7 @@ use cc4dgs_format::{Error, Result, config, unknown_name};
 use serde::Deserialize;
 
 pub(super) const SCHEMA: &str = "\
-max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. Without fine-tuning the deformer's weights are not counted. 0: psnr_db
+max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on validation views, else training views, is at most so much lower; `compact:max-drop=0.05dB` for short. Without fine-tuning the deformer's weights are not counted. 0: psnr_db
 max_size_mb = 0.0        # the best Gaussians in a file of at most so many MB, all included; `compact:max-size=5MB` for short. 0: no limit
 finetune = 500           # with --scene: iterations in which Gaussians and deformer are trained further with rounded values, in larger steps; 0: none
 size_weight = 4.0        # how much bits count in fine-tuning; 0 trains for accuracy alone
@@ -25,7 +25,7 @@ layers = 0               # sets of Gaussians by falling weight, which a player d
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Largest loss of PSNR on training views in dB; 0 chooses by `psnr_db`.
+    /// Largest loss of PSNR in dB on the views that judge; 0 chooses by `psnr_db`.
     pub max_drop_db: f64,
     /// Largest size of the file in MB; 0 is no limit.
     pub max_size_mb: f64,
@@ -53,10 +53,10 @@ pub struct Settings {
     pub canonical: bool,
     /// Sets of Gaussians by falling weight; 0 chooses by their number.
     pub layers: usize,
-    /// Whether the user chose the loss of PSNR, which needs a scene.
+    /// Whether the user asked for a loss of PSNR, which needs a scene.
     #[serde(skip)]
     pub drop_wanted: bool,
-    /// Whether the user chose the iterations of fine-tuning, which need a scene.
+    /// Whether the user asked for iterations of fine-tuning, which need a scene.
     #[serde(skip)]
     pub finetune_wanted: bool,
 }
@@ -107,8 +107,9 @@ impl Settings {
             off.iter().for_each(|key| drop(section.insert((*key).into(), 0.0.into())));
         }
         config::merge(&mut section, table);
-        let finetune_wanted = table.contains_key("finetune");
-        let settings = Self { drop_wanted, finetune_wanted, ..config::parse_section("codec compact", &section)? };
+        let parsed: Self = config::parse_section("codec compact", &section)?;
+        let (drop_wanted, finetune_wanted) = (drop_wanted && parsed.max_drop_db > 0.0, table.contains_key("finetune") && parsed.finetune > 0);
+        let settings = Self { drop_wanted, finetune_wanted, ..parsed };
         let bounds = [
             ("max_drop_db", settings.max_drop_db, 0.0..=20.0),
             ("max_size_mb", settings.max_size_mb, 0.0..=1e6),
@@ -118,9 +119,13 @@ impl Settings {
             ("size_weight", settings.size_weight, 0.0..=100.0),
             ("layers", settings.layers as f64, 0.0..=MOST_LAYERS as f64),
         ];
-        if settings.max_size_mb > 0.0 && settings.drop_wanted && settings.max_drop_db > 0.0 {
+        if settings.max_size_mb > 0.0 && settings.drop_wanted {
             let problem = format!("a loss of {} dB and a size of {} MB are both bounded", settings.max_drop_db, settings.max_size_mb);
             return Err(Error::parameter("codec compact", problem, "Bound one of them: max_drop_db or max_size_mb"));
+        }
+        if finetune_wanted && settings.max_drop_db == 0.0 && settings.max_size_mb == 0.0 {
+            let problem = "fine-tuning belongs to the search for a loss or a size, and neither is bounded";
+            return Err(Error::parameter("codec compact.finetune", problem, "Choose compact:max-drop=0.05dB or compact:max-size=5MB, or leave it out"));
         }
         match bounds.into_iter().find(|(_, value, range)| !range.contains(value)) {
             Some((name, value, range)) => {
@@ -128,6 +133,23 @@ impl Settings {
             }
             None => Ok(settings),
         }
+    }
+    /// Refuses a loss that the user asked for, where no views measure it.
+    pub fn check_without_views(&self) -> Result<()> {
+        if !self.drop_wanted {
+            return Ok(());
+        }
+        let problem = format!("a loss of {} dB of PSNR is measured on images of a scene, and there is none", self.max_drop_db);
+        let remedy = "Give the dataset to `cc4dgs compress` (--scene), or choose --codec compact:psnr=50dB or compact:max-size=5MB";
+        Err(Error::parameter("codec compact.max_drop_db", problem, remedy))
+    }
+    /// Refuses fine-tuning that the user asked for, where nothing can train the model further.
+    pub fn check_without_tuner(&self) -> Result<()> {
+        if !self.finetune_wanted {
+            return Ok(());
+        }
+        let problem = format!("{} iterations of fine-tuning need the images of a scene, and there is none", self.finetune);
+        Err(Error::parameter("codec compact.finetune", problem, "Give the dataset to `cc4dgs compress` (--scene), or leave --set finetune out"))
     }
 }
 
@@ -150,5 +172,25 @@ mod tests {
         let schema: toml::Table = SCHEMA.parse().unwrap();
         let (read, default) = (Settings::parse("", &schema).unwrap(), parse("").unwrap());
         assert_eq!(format!("{:?}", Settings { drop_wanted: false, finetune_wanted: false, ..read }), format!("{default:?}"));
+    }
+
+    #[test]
+    fn what_was_asked_for_and_needs_a_scene_is_refused_without_one() {
+        let parse = |profile: &str, table: &str| Settings::parse(profile, &table.parse().unwrap());
+        let without_scene = |profile: &str, table: &str| {
+            let settings = parse(profile, table).unwrap();
+            settings.check_without_tuner().and_then(|()| settings.check_without_views()).map_err(|e| e.to_string())
+        };
+        // What is 0 asks for nothing.
+        for (profile, table) in [("", ""), ("", "max_drop_db = 0.0\nfinetune = 0"), ("psnr=50dB", ""), ("max-size=5MB", "finetune = 0")] {
+            assert_eq!(without_scene(profile, table), Ok(()), "{profile} {table}");
+        }
+        for (profile, table, setting) in [("max-drop=0.1dB", "", "max_drop_db"), ("", "max_drop_db = 0.1", "max_drop_db"), ("", "finetune = 9", "finetune")] {
+            let refused = without_scene(profile, table).unwrap_err();
+            assert!(refused.starts_with(&format!("codec compact.{setting}: ")) && refused.contains("--scene"), "{refused}");
+        }
+        // Nothing is searched, with a scene or without.
+        assert!(parse("psnr=50dB", "finetune = 9").unwrap_err().to_string().contains("neither is bounded"));
+        parse("psnr=50dB", "finetune = 0").unwrap();
     }
 }

@@ -9,26 +9,40 @@ const UNIT: f64 = 127.0;
 /// Rows are basis vectors, by falling variance: [dims, dims], in steps of 1/127.
 pub type Basis = Vec<i8>;
 
-/// The basis of the weighted second moments of `rows` `[N,dims]`.
-pub fn basis(rows: &[f64], dims: usize, weights: &[f64]) -> Basis {
-    let upper = |i: usize| {
-        let mut sums = vec![0.0; dims];
-        for (row, weight) in rows.chunks_exact(dims).zip(weights) {
-            let scaled = weight * row[i];
-            sums[i..].iter_mut().zip(&row[i..]).for_each(|(sum, value)| *sum += scaled * value);
-        }
-        sums
-    };
-    let mut moments: Vec<f64> = (0..dims).into_par_iter().flat_map_iter(upper).collect();
-    for i in 0..dims {
-        for j in 0..i {
-            moments[i * dims + j] = moments[j * dims + i];
-        }
+/// Weighted second moments of rows that are added block by block.
+pub struct Moments {
+    dims: usize,
+    /// Their upper triangle `[dims,dims]`.
+    sums: Vec<f64>,
+}
+
+impl Moments {
+    pub fn new(dims: usize) -> Self {
+        Self { dims, sums: vec![0.0; dims * dims] }
     }
-    let vectors = eigenvectors(&mut moments, dims);
-    let mut order: Vec<usize> = (0..dims).collect();
-    order.sort_by(|&a, &b| moments[b * dims + b].total_cmp(&moments[a * dims + a]).then(a.cmp(&b)));
-    order.into_iter().flat_map(|v| (0..dims).map(move |i| (i, v))).map(|(i, v)| libm::round(UNIT * vectors[v * dims + i]) as i8).collect()
+    /// Adds `rows` `[M,dims]` with the first M `weights`.
+    pub fn add(&mut self, rows: &[f64], weights: &[f64]) {
+        let dims = self.dims;
+        self.sums.par_chunks_exact_mut(dims).enumerate().for_each(|(i, sums)| {
+            for (row, weight) in rows.chunks_exact(dims).zip(weights) {
+                let scaled = weight * row[i];
+                sums[i..].iter_mut().zip(&row[i..]).for_each(|(sum, value)| *sum += scaled * value);
+            }
+        });
+    }
+    /// Their basis.
+    pub fn basis(self) -> Basis {
+        let Self { dims, sums: mut moments } = self;
+        for i in 0..dims {
+            for j in 0..i {
+                moments[i * dims + j] = moments[j * dims + i];
+            }
+        }
+        let vectors = eigenvectors(&mut moments, dims);
+        let mut order: Vec<usize> = (0..dims).collect();
+        order.sort_by(|&a, &b| moments[b * dims + b].total_cmp(&moments[a * dims + a]).then(a.cmp(&b)));
+        order.into_iter().flat_map(|v| (0..dims).map(move |i| (i, v))).map(|(i, v)| libm::round(UNIT * vectors[v * dims + i]) as i8).collect()
+    }
 }
 
 /// Turns vectors into coordinates: `[dims,dims]` (row-major), the inverse of the transposed basis.
@@ -100,7 +114,12 @@ mod tests {
     fn vectors_come_back_and_energy_comes_first() {
         let (dims, n) = (9, 500);
         let rows: Vec<f64> = (0..n * dims).map(|k| ((k * k) as f64 * 0.37).sin() + 3.0 * ((k / dims) as f64).cos() * (k % dims) as f64).collect();
-        let basis = basis(&rows, dims, &vec![1.0; n]);
+        let (mut moments, mut blocks) = (Moments::new(dims), Moments::new(dims));
+        moments.add(&rows, &vec![1.0; n]);
+        // The same in blocks.
+        rows.chunks(dims * 64).for_each(|block| blocks.add(block, &[1.0; 64]));
+        let basis = moments.basis();
+        assert_eq!(blocks.basis(), basis);
         let (analysis, scaled) = (analysis(&basis, dims).unwrap(), scaled(&basis));
         let mut energy = vec![0.0; dims];
         for row in rows.chunks_exact(dims) {

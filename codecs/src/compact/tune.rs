@@ -3,13 +3,15 @@
 //! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The best
 //! file that keeps what is allowed is taken; if there is none, the one that needed no training.
 
-use super::encode::canonical;
+use super::bytes_of;
+use super::columns::Columns;
+use super::encode::make_canonical;
 use super::forecast::Forecast;
+use super::job::{Attempt, Job};
 use super::plan::Planner;
 use super::rounding::Rounder;
 use super::search::{file_bytes, note};
 use super::settings::Settings;
-use super::{Attempt, Job, bytes_of};
 use cc4dgs_format::{CodecContext, Error, Event, HostGaussians, Result, Stream, TuneModel, TunedModel, Tuning, WeightArray};
 
 /// Rounds of training, and how many follow at most while the last one has not kept what is allowed.
@@ -88,9 +90,10 @@ impl Goal {
 /// The best streams that `goal` allows, after training; `found` is what there is without. A round that fails is the last: what those before came to is kept.
 pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner: &dyn TuneModel, context: &CodecContext) -> Result<Tuned> {
     let megabytes = |bytes: usize| bytes as f64 / 1e6;
-    let mut model = tuner.start(job.planner.gaussians)?;
+    let gaussians = job.planner.gaussians;
+    let mut model = tuner.start(&gaussians.to_host())?;
     let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
-    let untuned = before - tuner.psnr(&found.attempt.rounded, &model.weights, Some(1.0))?;
+    let untuned = before - tuner.psnr(&job.restored(gaussians, &found.attempt.plan), &model.weights, Some(1.0))?;
     let first_weights = weight_bytes(tuner, &model.weights, 1.0)?;
     let first_bytes = bytes_of(found.streams) + first_weights;
     note(context, format!("without fine-tuning {:.4} MB with the deformer's weights, PSNR {untuned:.3} dB lower", megabytes(first_bytes)));
@@ -128,8 +131,8 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     let train = |model: &TunedModel, round: usize, octaves: f64| -> Result<(Outcome, f64)> {
         let quality = found.attempt.quality * libm::exp2(octaves);
         let weight_steps = libm::exp2(octaves + of_weights);
-        let planner = job.planner.of(&model.gaussians);
-        let (Attempt { plan, .. }, untrained) = job.coded_attempt(&planner, quality, &job.factors)?;
+        let planner = job.planner.of(Columns::from(&model.gaussians));
+        let (Attempt { plan, .. }, untrained) = job.coded(&planner, quality, &job.factors)?;
         let per_octave = saved_by_doubling(job, &planner, quality, bytes_of(&untrained))?;
         let bits_per_octave = 8.0 * per_octave;
         let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
@@ -139,8 +142,8 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         let of = (done, settings.finetune.max(done + iterations));
         let seed = context.seed.child("fine-tuning").index(round as u64);
         let mut model = tuner.tune(model, &Tuning { rounding, weight_steps, iterations, of, seed, size_weight: settings.size_weight, bits_per_octave })?;
-        model.gaussians = canonical(&model.gaussians, &job.free);
-        let (streams, rounded) = job.stored(&model.gaussians, &plan)?;
+        make_canonical(&mut model.gaussians.log_scales, &mut model.gaussians.quaternions, &job.free);
+        let (streams, rounded) = job.stored(Columns::from(&model.gaussians), &plan)?;
         let drop = before - tuner.psnr(&rounded, &model.weights, Some(weight_steps))?;
         let weights = weight_bytes(tuner, &model.weights, weight_steps)?;
         let bytes = bytes_of(&streams) + weights;
@@ -156,7 +159,9 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
             Goal::Drop(_) => (drop, 0.0),
             Goal::Bytes(_) => {
                 let file = file_bytes(context, &streams, Some((&model.weights, weight_steps)))?;
-                (file, if number < count + FURTHER { saved_weights(tuner, &model.weights, weight_steps, weights)? } else { 0.0 })
+                // Only steps of another round need it.
+                let goes_on = number < count || (file > goal.limit() && number < count + FURTHER);
+                (file, if goes_on { saved_weights(tuner, &model.weights, weight_steps, weights)? } else { 0.0 })
             }
         };
         Ok((Outcome { streams, model, weight_steps, bytes, drop, used }, per_octave + saved))
@@ -169,7 +174,8 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         }
         let (outcome, per_octave) = match train(&model, round, octaves) {
             Err(e) if !matches!(e, Error::Interrupted(_)) => {
-                let message = format!("fine-tuning ended in round {} of {count}, and what was reached before is kept: {e}", round + 1);
+                let of = count.max(round + 1);
+                let message = format!("fine-tuning ended in round {} of {of}, and what was reached before is kept: {e}", round + 1);
                 context.events.emit(&Event::Warning { object: "codec compact".into(), message });
                 break;
             }
@@ -210,14 +216,14 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
 }
 
 /// What `rounded` loses of the PSNR of `gaussians` in dB, with the deformer's weights as they are stored without training.
-pub fn loss(tuner: &dyn TuneModel, gaussians: &HostGaussians, rounded: &HostGaussians) -> Result<f64> {
-    let model = tuner.start(gaussians)?;
+pub fn loss(tuner: &dyn TuneModel, gaussians: Columns, rounded: &HostGaussians) -> Result<f64> {
+    let model = tuner.start(&gaussians.to_host())?;
     Ok(tuner.psnr(&model.gaussians, &model.weights, None)? - tuner.psnr(rounded, &model.weights, Some(1.0))?)
 }
 
 /// The bytes that steps twice as large save where those of `quality` give `bytes`.
 fn saved_by_doubling(job: &Job, planner: &Planner, quality: f64, bytes: usize) -> Result<f64> {
-    let (_, coarser) = job.coded_attempt(planner, 2.0 * quality, &job.factors)?;
+    let (_, coarser) = job.coded(planner, 2.0 * quality, &job.factors)?;
     Ok(bytes.saturating_sub(bytes_of(&coarser)).max(1) as f64)
 }
 

@@ -1,13 +1,15 @@
 //! The streams of quantised Gaussians.
 
 use super::colors::{self, SMALL_CONTEXTS, code_small};
-use super::encode::{Classes, Integers, coefficients};
-use super::geometry::{KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
+use super::columns::{Columns, sorted};
+use super::encode::Integers;
+use super::geometry::{KEY_CONTEXTS, ROTATION_CONTEXTS, code_keys, code_rotations};
 use super::predict::{Known, Linear};
 use super::{VERSION, attributes, blocks, layers};
+use cc4dgs_format::storage::META;
 use cc4dgs_format::storage::column::{self, Target};
-use cc4dgs_format::storage::{META, Shape};
-use cc4dgs_format::{HostGaussians, Result, Stream};
+use cc4dgs_format::{Result, Stream};
+use std::ops::Range;
 use std::slice;
 
 pub(super) const CLASSES: &str = "classes";
@@ -60,80 +62,87 @@ pub fn known_scales(color: u8, shape: u8, scales: &[i32; 3], scale_limit: u8, li
     out
 }
 
-/// All streams; `order` sorts the rows by layer, of `sizes` rows each, and then by their keys.
-pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &[usize], sizes: &[usize]) -> Result<Vec<Stream>> {
+/// All streams; `order` sorts the rows by layer, of `sizes` rows each, and then by their keys. Integers are put into that order column by column, and given up
+/// once they are coded.
+pub fn write(gaussians: Columns, of: Integers, motion: &Motion, order: &[usize], sizes: &[usize]) -> Result<Vec<Stream>> {
     let (n, ranges) = (order.len(), layers::ranges(sizes));
-    let sorted = gaussians.select(order);
+    let exact = write_exact(gaussians, &of, order);
+    let Integers { plan, classes: given, scales, rotations, opacities, keys, colors, attributes, .. } = of;
     let pick = |values: &[u8]| order.iter().map(|&i| values[i]).collect::<Vec<u8>>();
-    let Classes { colors: classes, shapes, .. } = of.classes;
-    let (classes, shapes) = (pick(classes), pick(shapes));
-    let scales: Vec<[i32; 3]> = order.iter().map(|&i| of.scales[i]).collect();
+    let (classes, shapes) = (pick(&given.colors), pick(&given.shapes));
     let moving: Vec<u8> = order.iter().map(|&i| motion.moving.as_ref().map_or(0, |m| u8::from(m[i]))).collect();
-    let opacities: Vec<i32> = order.iter().map(|&i| of.opacities[i]).collect();
-    let colors: Vec<Vec<i32>> =
-        of.plan.degrees.iter().zip(&of.colors).map(|(d, codes)| order.iter().flat_map(|&i| &codes[i * d.dims..(i + 1) * d.dims]).copied().collect()).collect();
-    let geometry = &of.plan.geometry;
-    let rows = || classes.iter().zip(&shapes);
-    let for_scales: Vec<Known> = rows().map(|(&c, &s)| known_classes(c, s, false, geometry.scale_limit)).collect();
-    let for_opacities: Vec<Known> =
-        rows().zip(&scales).map(|((&c, &s), scales)| known_scales(c, s, scales, geometry.scale_limit, geometry.opacity_limit)).collect();
-    let for_colors: Vec<Known> = rows().map(|(&c, &s)| known_classes(c, s, true, 15)).collect();
-    let (scale_plan, opacity_plan) = (Linear::fit(3, scales.as_flattened(), &for_scales), Linear::fit(1, &opacities, &for_opacities));
-    let color_plan = Linear::fit(3, &colors[0], &for_colors);
+    let (scales, opacities) = (sorted(scales, 1, order), sorted(opacities, 1, order));
+    let mut colors = colors.into_iter().map(|codes| codes.values);
+    let base = sorted(colors.next().unwrap_or_default(), 3, order);
+    let geometry = &plan.geometry;
+    let for_scales = |i: usize| known_classes(classes[i], shapes[i], false, geometry.scale_limit);
+    let for_opacities = |i: usize| known_scales(classes[i], shapes[i], &scales[i], geometry.scale_limit, geometry.opacity_limit);
+    let for_colors = |i: usize| known_classes(classes[i], shapes[i], true, 15);
+    // A fit reads its rows one after the other.
+    let (scale_plan, (opacity_plan, color_plan)) = rayon::join(
+        || Linear::fit(3, scales.as_flattened(), for_scales),
+        || rayon::join(|| Linear::fit(1, &opacities, for_opacities), || Linear::fit(3, &base, for_colors)),
+    );
 
     let mut meta = vec![VERSION];
-    Shape::of(&sorted).write(&mut meta)?;
+    gaussians.shape().write(&mut meta)?;
     geometry.write(&mut meta);
     meta.extend([motion.free, u8::from(motion.moving.is_some())]);
     motion.levels.iter().for_each(|v| meta.extend(v.to_le_bytes()));
     layers::write(sizes, &mut meta);
     [&scale_plan, &opacity_plan, &color_plan].iter().for_each(|plan| plan.write(&mut meta));
-    of.plan.degrees.iter().for_each(|d| d.write(&mut meta));
+    plan.degrees.iter().for_each(|d| d.write(&mut meta));
 
     let small = |name: &str, values: &[u8]| blocks::encode(name, SMALL_CONTEXTS, &ranges, |coder, range| code_small(coder, &mut values[range].to_vec()));
-    let predicted = |name: &str, dims: usize, plan: &Linear, codes: &[i32], known: &[Known]| {
-        blocks::encode(name, Linear::contexts(dims), &ranges, |coder, range| {
-            plan.code(coder, &mut codes[range.start * dims..range.end * dims].to_vec(), &known[range])
-        })
-    };
-    let apart: Vec<u8> = rows().map(|(&c, &s)| s + APART - c).collect();
-    let mut streams = vec![Stream { name: META.into(), bytes: meta }, Stream { name: EXACT.into(), bytes: write_exact(&sorted, of, order) }];
+    let apart: Vec<u8> = classes.iter().zip(&shapes).map(|(&c, &s)| s + APART - c).collect();
+    let mut streams = vec![Stream { name: META.into(), bytes: meta }, Stream { name: EXACT.into(), bytes: exact }];
     let mut columns = vec![small(CLASSES, &classes)?, small(SHAPES, &apart)?];
     if motion.moving.is_some() {
         columns.push(small(MOVING, &moving)?);
     } else {
-        let column = column::encode(&sorted.dynamic_scores, SCORE);
+        let column = column::encode(&sorted(gaussians.dynamic_scores.to_vec(), 1, order), SCORE);
         let mut bytes = Vec::new();
         column.form.write(&mut bytes);
         column::write_escapes(&column.escapes, &mut bytes);
         bytes.extend(column.codes);
         streams.push(Stream { name: SCORES.into(), bytes });
     }
-    columns.push(predicted(SCALES, 3, &scale_plan, scales.as_flattened(), &for_scales)?);
-    let keys: Vec<u64> = order.iter().map(|&i| of.keys[i]).collect();
+    columns.push(predicted(SCALES, 3, &ranges, &scale_plan, scales.as_flattened(), for_scales)?);
+    let keys = sorted(keys, 1, order);
     columns.push(blocks::encode(MEANS, KEY_CONTEXTS, &ranges, |coder, range| {
         let shifts: Vec<u32> = range.clone().map(|i| geometry.position_shift(scales[i], shapes[i])).collect();
         code_keys(coder, &mut keys[range].to_vec(), &shifts)
     })?);
-    let rotations: Vec<Rotation> = order.iter().map(|&i| of.rotations[i]).collect();
+    drop(keys);
+    let rotations = sorted(rotations, 1, order);
     columns.push(blocks::encode(ROTATIONS, ROTATION_CONTEXTS, &ranges, |coder, range| {
         let shifts: Vec<(i32, bool)> = range.clone().map(|i| (geometry.rotation_shift(scales[i], shapes[i]), motion.is_free(i, &moving))).collect();
         code_rotations(coder, &mut rotations[range].to_vec(), &shifts)
     })?);
-    columns.push(predicted(OPACITIES, 1, &opacity_plan, &opacities, &for_opacities)?);
-    columns.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
+    drop(rotations);
+    columns.push(predicted(OPACITIES, 1, &ranges, &opacity_plan, &opacities, for_opacities)?);
+    columns.push(predicted(&color_name(0), 3, &ranges, &color_plan, &base, for_colors)?);
     let mut columns: Vec<_> = columns.into_iter().map(Vec::into_iter).collect();
     ranges.iter().for_each(|_| streams.extend(columns.iter_mut().filter_map(Iterator::next)));
-    streams.extend(attributes::write(&sorted, of, order, motion.moving.is_some().then_some(moving.as_slice()))?);
+    streams.extend(attributes::write(gaussians, &attributes, given, order, motion.moving.is_some().then_some(moving.as_slice()))?);
     let (all, mut sizes) = (0..n, vec![0; n]);
-    for (degree, (plan, codes)) in of.plan.degrees.iter().zip(&colors).enumerate().skip(1) {
+    for ((degree, plan), codes) in plan.degrees.iter().enumerate().skip(1).zip(colors) {
+        let codes = sorted(codes, plan.dims, order);
         streams.extend(blocks::encode(&color_name(degree), colors::CONTEXTS, slice::from_ref(&all), |coder, range| {
             let mut values = codes[range.start * plan.dims..range.end * plan.dims].to_vec();
             plan.code(coder, &mut values, &classes[range.clone()], &mut sizes[range].to_vec(), degree == 1)
         })?);
-        plan.note(codes, &classes, &mut sizes);
+        plan.note(&codes, &classes, &mut sizes);
     }
     Ok(streams)
+}
+
+/// The streams of rows `codes` `[N,dims]` that `plan` predicts from what is `known` about each.
+fn predicted(name: &str, dims: usize, ranges: &[Range<usize>], plan: &Linear, codes: &[i32], known: impl Fn(usize) -> Known + Sync) -> Result<Vec<Stream>> {
+    blocks::encode(name, Linear::contexts(dims), ranges, |coder, range| {
+        let known: Vec<Known> = range.clone().map(&known).collect();
+        plan.code(coder, &mut codes[range.start * dims..range.end * dims].to_vec(), &known)
+    })
 }
 
 /// The stream of a degree's coefficients.
@@ -141,25 +150,18 @@ pub fn color_name(degree: usize) -> String {
     format!("sh.{degree}")
 }
 
-/// Columns of `gaussians` in the order of [`Integers::exact`].
-fn exact_columns(gaussians: &HostGaussians) -> Vec<(usize, Vec<f32>)> {
-    let plain = [&gaussians.means, &gaussians.log_scales, &gaussians.quaternions, &gaussians.opacity_logits];
-    let degrees = (0..=gaussians.sh_degree).map(|d| (3 * (2 * d + 1), coefficients(gaussians, d)));
-    plain.into_iter().zip([3, 3, 4, 1]).map(|(values, width)| (width, values.clone())).chain(degrees).collect()
-}
-
-fn write_exact(sorted: &HostGaussians, of: &Integers, order: &[usize]) -> Vec<u8> {
+fn write_exact(gaussians: Columns, of: &Integers, order: &[usize]) -> Vec<u8> {
     let mut out = Vec::new();
     let mut position = vec![0u32; order.len()];
     order.iter().enumerate().for_each(|(at, &i)| position[i] = at as u32);
-    for (rows, (width, values)) in of.exact.iter().zip(exact_columns(sorted)) {
+    for (rows, values) in of.exact_rows().zip(gaussians.all_rows()) {
         let mut rows: Vec<u32> = rows.iter().map(|&i| position[i]).collect();
         rows.sort_unstable();
         out.extend((rows.len() as u32).to_le_bytes());
         if rows.len() < order.len() {
             rows.iter().for_each(|row| out.extend(row.to_le_bytes()));
         }
-        rows.iter().flat_map(|&row| &values[row as usize * width..(row as usize + 1) * width]).for_each(|v| out.extend(v.to_le_bytes()));
+        rows.iter().flat_map(|&row| values.row(order[row as usize])).for_each(|v| out.extend(v.to_le_bytes()));
     }
     out
 }

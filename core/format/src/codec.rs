@@ -62,6 +62,14 @@ pub trait AttributeCodec: Send + Sync {
     fn keeps_motion(&self) -> bool {
         false
     }
+    /// Refuses settings that need a scene ([`CodecContext::views`], [`CodecContext::tuner`]). It is asked where there is none, before any work;
+    /// [`AttributeCodec::encode`] refuses them as well.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`](crate::Error::Parameter) that names the setting and the remedy.
+    fn check_without_scene(&self) -> Result<()> {
+        Ok(())
+    }
     /// The bytes that the whole file may have at most, where the user bounded them ([`CodecContext::file_bytes`]).
     fn most_bytes(&self) -> Option<u64> {
         None

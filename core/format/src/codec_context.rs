@@ -13,6 +13,8 @@ pub struct CodecContext<'a> {
     pub events: &'a dyn EventSink,
     /// The views that the model was trained on.
     pub views: Option<&'a dyn TrainingViews>,
+    /// The views that judge what is lost, where they are stated: see [`CodecContext::judging_views`].
+    pub judges: Option<&'a dyn TrainingViews>,
     /// Renders the model with other Gaussians.
     pub renderer: Option<&'a dyn RenderModel>,
     /// The deformer of the model; `None` for static models.
@@ -39,6 +41,7 @@ impl<'a> CodecContext<'a> {
             limits,
             events,
             views: None,
+            judges: None,
             renderer: None,
             deformer: None,
             weight_importance: None,
@@ -47,15 +50,25 @@ impl<'a> CodecContext<'a> {
             file_bytes: None,
         }
     }
+    /// The views on which a loss of PSNR is measured: validation views where the scene has some, else those that the model was trained on. `None` where there are
+    /// no views.
+    pub fn judging_views(&self) -> Option<&'a dyn TrainingViews> {
+        self.judges.or(self.views).filter(|views| !views.is_empty())
+    }
 }
 
-/// The training views of a scene, in an order in which every so many are of all cameras. Images are decoded on demand. Held-out views are not included.
+/// The training views of a scene, or its validation views where those judge, in an order in which every so many are of all cameras. Images are decoded on
+/// demand. Test views are not included.
 pub trait TrainingViews {
     /// The number of views.
     fn len(&self) -> usize;
     /// Whether there are none.
     fn is_empty(&self) -> bool {
         self.len() == 0
+    }
+    /// What they are called in messages: `training` or `validation`.
+    fn kind(&self) -> &'static str {
+        "training"
     }
     /// Camera and time (0..1) of the view `index`, which must be below [`TrainingViews::len`].
     fn view(&self, index: usize) -> (&Camera, f32);
@@ -67,6 +80,14 @@ pub trait TrainingViews {
 pub trait RenderModel {
     /// Renders `gaussians`, deformed to `time_norm` (0..1), with `camera`. `gaussians` must have the extra attributes that the deformer reads.
     fn render(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes>;
+    /// Renders `gaussians` in `views`, each a camera and a time (0..1), and calls `take` with the index and the image of each in turn. The images are those of
+    /// [`RenderModel::render`]; what views share need not be computed for each.
+    ///
+    /// # Errors
+    /// What the renderer reports, and the first error of `take`.
+    fn render_views(&self, gaussians: &HostGaussians, views: &[(&Camera, f32)], take: &mut dyn FnMut(usize, RenderedPlanes) -> Result<()>) -> Result<()> {
+        views.iter().enumerate().try_for_each(|(index, &(camera, time_norm))| take(index, self.render(gaussians, camera, time_norm)?))
+    }
     /// The colour behind everything, RGB in 0..1.
     fn background(&self) -> [f32; 3];
     /// An unbiased estimate, for every value of every column, of the sum over pixels and channels of the squared derivative of the image by that value as it is
@@ -85,15 +106,15 @@ pub trait RenderModel {
 /// What the renderer and the images report.
 pub fn psnr_on_views(gaussians: &HostGaussians, views: &dyn TrainingViews, renderer: &dyn RenderModel, most: usize) -> Result<f64> {
     let chosen = views.len().min(most);
+    let index = |k: usize| k * views.len() / chosen;
+    let cameras: Vec<(&Camera, f32)> = (0..chosen).map(|k| views.view(index(k))).collect();
     let mut sum = 0.0;
-    for k in 0..chosen {
-        let index = k * views.len() / chosen;
-        let (camera, time_norm) = views.view(index);
-        let drawn = renderer.render(gaussians, camera, time_norm)?;
-        let truth = views.image(index)?.to_planes(renderer.background());
+    renderer.render_views(gaussians, &cameras, &mut |k, drawn| {
+        let truth = views.image(index(k))?.to_planes(renderer.background());
         let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
         sum += psnr_of(error / truth.len().max(1) as f64);
-    }
+        Ok(())
+    })?;
     Ok(sum / chosen.max(1) as f64)
 }
 

@@ -62,6 +62,18 @@ impl ExtraAttribute {
     pub fn needed_in(self, rows: Vec<bool>, start: f32) -> Self {
         Self { needed: Some(NeededRows { rows, start }), ..self }
     }
+    /// The rows with the indices `keep`, in that order. The indices must be below N.
+    pub fn select(&self, keep: &[usize]) -> Self {
+        let needed = self.needed.as_ref().map(|n| NeededRows { rows: keep.iter().map(|&i| n.rows[i]).collect(), start: n.start });
+        Self { width: self.width, values: pick(&self.values, self.width, keep), tolerance: self.tolerance, needed }
+    }
+}
+
+/// The rows with the indices `keep` of `values` `[N,width]`, in that order.
+fn pick(values: &[f32], width: usize, keep: &[usize]) -> Vec<f32> {
+    let mut out = Vec::with_capacity(keep.len() * width);
+    keep.iter().for_each(|&i| out.extend_from_slice(&values[i * width..(i + 1) * width]));
+    out
 }
 
 /// Gaussians as plain row-major arrays.
@@ -197,23 +209,41 @@ impl HostGaussians {
     }
     /// The Gaussians with the indices `keep`, in that order. The indices must be below N.
     pub fn select(&self, keep: &[usize]) -> Self {
-        let pick = |width: usize, values: &[f32]| keep.iter().flat_map(|&i| values[i * width..(i + 1) * width].iter().copied()).collect::<Vec<_>>();
         let mut out = Self { sh_degree: self.sh_degree, ..Default::default() };
         for ((_, width, from), (_, _, to)) in self.columns().into_iter().zip(out.columns_mut()) {
-            *to = pick(width, from);
+            *to = pick(from, width, keep);
         }
-        for (name, a) in &self.extra {
-            let needed = a.needed.as_ref().map(|n| NeededRows { rows: keep.iter().map(|&i| n.rows[i]).collect(), start: n.start });
-            out.extra.insert(name.clone(), ExtraAttribute { width: a.width, values: pick(a.width, &a.values), tolerance: a.tolerance, needed });
-        }
+        out.extra = self.extra.iter().map(|(name, a)| (name.clone(), a.select(keep))).collect();
         out
+    }
+    /// [`HostGaussians::select`] of Gaussians that are not needed afterwards. One column at a time is in memory twice.
+    #[must_use]
+    pub fn into_selected(mut self, keep: &[usize]) -> Self {
+        for (_, width, values) in self.columns_mut() {
+            *values = pick(values, width, keep);
+        }
+        self.extra.values_mut().for_each(|a| *a = a.select(keep));
+        self
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{HostGaussians, unit_quaternion};
+    use super::{ExtraAttribute, HostGaussians, unit_quaternion};
     use crate::Limits;
+
+    #[test]
+    fn rows_are_selected_in_the_order_asked_for() {
+        let mut host = HostGaussians { sh_degree: 1, opacity_logits: vec![0.0; 4], ..Default::default() };
+        host.columns_mut().into_iter().for_each(|(_, width, values)| *values = (0..4 * width).map(|k| (k / width) as f32).collect());
+        host.extra.insert("a".into(), ExtraAttribute::exact(2, vec![0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0]).needed_in(vec![false, true, false, true], 0.5));
+        let found = host.select(&[3, 0, 3]);
+        for (name, width, values) in found.columns() {
+            assert_eq!(*values, [3.0f32, 0.0, 3.0].map(|v| vec![v; width]).concat(), "{name}");
+        }
+        assert_eq!(found.extra["a"], ExtraAttribute::exact(2, vec![3.0, 3.0, 0.0, 0.0, 3.0, 3.0]).needed_in(vec![true, false, true], 0.5));
+        assert_eq!(host.into_selected(&[3, 0, 3]), found);
+    }
 
     #[test]
     fn whose_fault_invalid_gaussians_are_is_said() {

@@ -18,6 +18,17 @@ pub enum Split {
     Test,
 }
 
+impl Split {
+    /// What its views are called: `training`, `validation` or `test`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Train => "training",
+            Self::Validation => "validation",
+            Self::Test => "test",
+        }
+    }
+}
+
 /// One image of the scene: a camera at a time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
@@ -139,6 +150,11 @@ impl Scene {
     /// Indices of the views of `split`, in order.
     pub fn split(&self, split: Split) -> Vec<usize> {
         (0..self.views.len()).filter(|&i| self.views[i].split == split).collect()
+    }
+    /// The split whose images judge what a trained model loses where Gaussians are removed, values rounded or weights stored in fewer bits: validation views where
+    /// there are some, because no training has fitted them, else training views. Test views never judge: they score what comes of it.
+    pub fn judging_split(&self) -> Split {
+        if self.views.iter().any(|view| view.split == Split::Validation) { Split::Validation } else { Split::Train }
     }
     /// The camera of a view.
     pub fn camera(&self, view: usize) -> &Camera {
@@ -274,6 +290,17 @@ mod tests {
             let error = of(time_norm).unwrap_err();
             assert!(error.contains(&format!("at time {time_norm}; times are from 0 to 1")), "{error}");
         }
+    }
+
+    #[test]
+    fn validation_views_judge_where_there_are_some() {
+        let judging = |splits: &[Split]| {
+            let camera = Camera::look_at("a", (8, 8), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+            let views = splits.iter().enumerate().map(|(frame, &split)| View { camera: 0, frame, time_norm: 0.0, split }).collect();
+            Scene::new("s", vec![camera], views, Arc::new(NoImages), 0).unwrap().judging_split()
+        };
+        assert_eq!(judging(&[Split::Train, Split::Test]), Split::Train);
+        assert_eq!(judging(&[Split::Train, Split::Test, Split::Validation]), Split::Validation);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::encoded_once::EncodedOnce;
-use crate::field_weights::StoredField;
+use crate::field_weights::{FieldWeights, StoredField};
 use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
@@ -17,6 +17,7 @@ use cc4dgs_core::{
 };
 use serde::Serialize;
 use serde_json::Value;
+use std::borrow::Cow;
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -30,13 +31,25 @@ pub struct ArchiveOptions<'a> {
     pub codec: &'a str,
     /// Settings of that codec.
     pub settings: &'a toml::Table,
-    /// Weight codec of the field: see [`FieldWeights::parse`](crate::field_weights::FieldWeights::parse).
+    /// Weight codec of the field: see [`FieldWeights::parse`].
     pub field_weights: &'a str,
     /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
     /// field. Every codec works without.
     pub scene: Option<(&'a Scene, &'a Device)>,
     /// Trains the model further with rounded values, for codecs that make use of it. The archive's deformer then has the trained weights.
     pub tuner: Option<&'a dyn TuneModel>,
+}
+
+impl ArchiveOptions<'_> {
+    /// Refuses codecs and settings that do not exist, and where there is no scene, those that need one. Call it before anything is read;
+    /// [`Model::to_archive`] refuses the same.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names the codec or setting and the remedy.
+    pub fn check(codec: &str, settings: &toml::Table, field_weights: &str, has_scene: bool, registry: &Registry) -> Result<()> {
+        let (codec, weights) = (registry.build_codec(codec, settings)?, FieldWeights::parse(field_weights, registry)?);
+        if has_scene { Ok(()) } else { codec.check_without_scene().and_then(|()| weights.check_without_scene()) }
+    }
 }
 
 impl Model {
@@ -126,9 +139,11 @@ impl Model {
         let codec = registry.build_codec(spec, settings)?;
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         let views = scene.map(|(scene, _)| SceneViews::new(scene));
+        let judges = scene.map(|(scene, _)| SceneViews::judging(scene));
         let services = scene.map(|(_, device)| ModelServices::new(self, registry, device)).transpose()?;
         let context = |seed: Seed| CodecContext {
             views: views.as_ref().map(|v| v as &dyn TrainingViews),
+            judges: judges.as_ref().map(|v| v as &dyn TrainingViews),
             renderer: services.as_ref().map(|s| s as &dyn cc4dgs_core::RenderModel),
             deformer: services.as_ref().filter(|_| self.field.is_some()).map(|s| s as &dyn cc4dgs_core::EvaluateDeformer),
             tuner,
@@ -142,6 +157,10 @@ impl Model {
         };
         let (movable, field) = (self.movable(), self.stored_field());
         let weights = field.map(|f| StoredField::new(f, field_weights, registry)).transpose()?;
+        if scene.is_none() {
+            codec.check_without_scene()?;
+            weights.as_ref().map_or(Ok(()), |of| of.chosen.check_without_scene())?;
+        }
         let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
         let moving = if movable { self.moving } else { Moving::Nothing };
         let mut extra = serde_json::Map::from_iter([(MOVING.to_string(), json(&moving)?)]);
@@ -241,10 +260,13 @@ impl Model {
         let remedy = "Remove Gaussians with `cc4dgs prune`, or raise limits.max_bytes (--limit max_bytes=…), which readers of the file need, too";
         Err(Error::limit(object, bytes, limit, remedy))
     }
-    /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
-    fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {
+    /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move. A copy only where there are any.
+    fn for_codec(&self, codec: &dyn AttributeCodec) -> Cow<'_, HostGaussians> {
+        let attributes = self.field.as_ref().map(|f| f.field.attributes()).unwrap_or_default();
+        if attributes.iter().all(|spec| !self.gaussians.extra.contains_key(&spec.name)) {
+            return Cow::Borrowed(&self.gaussians);
+        }
         let mut out = self.gaussians.clone();
-        let Some(field) = &self.field else { return out };
         // A score just under the threshold may come back over it.
         let losses = if codec.keeps_motion() { Vec::new() } else { codec.losses() };
         let slack = losses.iter().find(|l| l.attribute == "dynamic_scores").map_or(0.0, |l| SCORE_SLACK * l.relative_rms * deviation(&out.dynamic_scores));
@@ -257,13 +279,13 @@ impl Model {
             rows.into_iter().for_each(|row| needed[row] = true);
             needed
         });
-        for spec in field.field.attributes() {
+        for spec in attributes {
             if let Some(attribute) = out.extra.get_mut(&spec.name) {
                 attribute.tolerance = spec.tolerance;
                 attribute.needed = needed.clone().map(|rows| NeededRows { rows, start: spec.start });
             }
         }
-        out
+        Cow::Owned(out)
     }
 }
 

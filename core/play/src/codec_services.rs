@@ -1,4 +1,4 @@
-//! What a codec may use of a model and its scene while it encodes: training views, a renderer, the field.
+//! What a codec may use of a model and its scene while it encodes: training views, those that judge, a renderer, the field.
 
 use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
@@ -12,6 +12,7 @@ use cc4dgs_core::{
 /// The views of one split of a scene, camera after camera ([`by_camera`]): every so many are of all cameras.
 pub struct SceneViews<'a> {
     scene: &'a Scene,
+    split: Split,
     views: Vec<usize>,
 }
 
@@ -22,13 +23,20 @@ impl<'a> SceneViews<'a> {
     }
     /// The views of `split`.
     pub fn of(scene: &'a Scene, split: Split) -> Self {
-        Self { scene, views: by_camera(scene, &scene.split(split)) }
+        Self { scene, split, views: by_camera(scene, &scene.split(split)) }
+    }
+    /// The views of `scene` on which a loss is measured ([`Scene::judging_split`]).
+    pub fn judging(scene: &'a Scene) -> Self {
+        Self::of(scene, scene.judging_split())
     }
 }
 
 impl TrainingViews for SceneViews<'_> {
     fn len(&self) -> usize {
         self.views.len()
+    }
+    fn kind(&self) -> &'static str {
+        self.split.name()
     }
     fn view(&self, index: usize) -> (&Camera, f32) {
         let view = self.views[index];
@@ -72,10 +80,14 @@ impl<'a> ModelServices<'a> {
         Ok(self.rasterizer.render(&Splats::from_gaussians(&moved, moved.sh_degree), camera, &self.settings)?.image())
     }
     fn moved(&self, host: &HostGaussians, time_norm: f32) -> Result<Gaussians> {
+        self.unmoved(host)?.at(time_norm)
+    }
+    /// What all times share.
+    fn unmoved(&self, host: &HostGaussians) -> Result<Unmoved<'_>> {
         let canonical = Gaussians::from_host(host, &self.device);
         let rows = self.model.moving.rows(&host.dynamic_scores);
         let nothing_moves = host.is_empty() || rows.as_ref().is_some_and(Vec::is_empty);
-        let Some(deformer) = self.deformer.filter(|d| !nothing_moves && !d.is_static()) else { return Ok(canonical) };
+        let Some(deformer) = self.deformer.filter(|d| !nothing_moves && !d.is_static()) else { return Ok(Unmoved { canonical, motion: None }) };
         let rows = rows.map(|rows| {
             let indices: Vec<i64> = rows.iter().map(|&row| row as i64).collect();
             Tensor::<1, Int>::from_data(TensorData::new(indices, [rows.len()]), &self.device)
@@ -83,7 +95,33 @@ impl<'a> ModelServices<'a> {
         let select = |values: &Tensor<2>| rows.as_ref().map_or_else(|| values.clone(), |rows| values.clone().select(0, rows.clone()));
         let attributes: Vec<Tensor<2>> = deformer.attributes().iter().filter_map(|spec| canonical.extra.get(&spec.name)).map(select).collect();
         let features = deformer.spatial(&SpatialInput { means_world: select(&canonical.means), attributes })?.values;
-        deformer.deform(features, time_norm)?.apply(self.model.field.as_ref().map_or("", |f| f.name()), &canonical, rows.as_ref())
+        let name = self.model.field.as_ref().map_or("", |f| f.name());
+        Ok(Unmoved { canonical, motion: Some(Motion { deformer, name, features, rows }) })
+    }
+    fn drawn(&self, moved: &Gaussians, camera: &Camera) -> Result<RenderedPlanes> {
+        let output = self.rasterizer.render(&Splats::from_gaussians(moved, moved.sh_degree), camera, &self.settings)?;
+        Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
+    }
+}
+
+/// Canonical Gaussians on the device, and how they move, if they do.
+struct Unmoved<'a> {
+    canonical: Gaussians,
+    motion: Option<Motion<'a>>,
+}
+
+struct Motion<'a> {
+    deformer: &'a dyn Deformer,
+    name: &'a str,
+    /// Of the moving Gaussians, whose indices are `rows`; `None` if all move.
+    features: Tensor<2>,
+    rows: Option<Tensor<1, Int>>,
+}
+
+impl Unmoved<'_> {
+    fn at(&self, time_norm: f32) -> Result<Gaussians> {
+        let Some(Motion { deformer, name, features, rows }) = &self.motion else { return Ok(self.canonical.clone()) };
+        deformer.deform(features.clone(), time_norm)?.apply(name, &self.canonical, rows.as_ref())
     }
 }
 
@@ -95,9 +133,11 @@ impl EvaluateDeformer for ModelServices<'_> {
 
 impl RenderModel for ModelServices<'_> {
     fn render(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes> {
-        let moved = self.moved(gaussians, time_norm)?;
-        let output = self.rasterizer.render(&Splats::from_gaussians(&moved, moved.sh_degree), camera, &self.settings)?;
-        Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
+        self.drawn(&self.moved(gaussians, time_norm)?, camera)
+    }
+    fn render_views(&self, gaussians: &HostGaussians, views: &[(&Camera, f32)], take: &mut dyn FnMut(usize, RenderedPlanes) -> Result<()>) -> Result<()> {
+        let unmoved = self.unmoved(gaussians)?;
+        views.iter().enumerate().try_for_each(|(index, &(camera, time_norm))| take(index, self.drawn(&unmoved.at(time_norm)?, camera)?))
     }
     fn background(&self) -> [f32; 3] {
         self.model.background_on(None)

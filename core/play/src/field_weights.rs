@@ -29,7 +29,7 @@ pub struct FieldWeights {
     pub name: String,
     /// Its settings.
     pub settings: toml::Table,
-    /// Largest loss of PSNR on training views in dB, for a search.
+    /// Largest loss of PSNR in dB on the views that judge ([`Scene::judging_split`]), for a search.
     pub max_drop_db: Option<f64>,
 }
 
@@ -56,6 +56,18 @@ impl FieldWeights {
         let number = limit.strip_suffix("dB").unwrap_or(limit).trim().parse::<f64>().ok().filter(|v| *v > 0.0 && v.is_finite());
         out.max_drop_db = Some(number.ok_or_else(|| Error::parameter(object, format!("'{limit}' is no number of dB"), "Write compact:max-drop=0.01dB"))?);
         Ok(out)
+    }
+    /// Refuses a search, which needs a scene. Call it where there is none, before any work.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names the weight codec and the remedy.
+    pub fn check_without_scene(&self) -> Result<()> {
+        self.max_drop_db.map_or(Ok(()), |limit| Err(self.needs_scene(limit)))
+    }
+    fn needs_scene(&self, limit: f64) -> Error {
+        let object = format!("weight codec '{}:max-drop={limit}dB'", self.name);
+        let remedy = "Give the dataset to `cc4dgs compress` (--scene), or state the bits: --field-weights compact:bits=6";
+        Error::parameter(object, "a loss of PSNR is measured on images of a scene, and there is none", remedy)
     }
     /// How much images depend on each weight of `model`, where the codec makes use of it; measured on training views.
     ///
@@ -86,16 +98,13 @@ impl FieldWeights {
         let Some(limit) = self.max_drop_db else {
             return Ok((registry.build_weight_codec(&self.name, &self.settings)?.encode(weights, context)?, self.settings.clone()));
         };
-        let (Some(device), Some(views)) = (scene, context.views.filter(|v| !v.is_empty())) else {
-            let problem = "a loss of PSNR is measured on training views, and there are none";
-            return Err(Error::parameter("weight codec", problem, "Give the dataset with --scene, or a number of bits such as compact:bits=6"));
-        };
+        let Some((device, judges)) = scene.zip(context.judging_views()) else { return Err(self.needs_scene(limit)) };
         let Some(of) = &model.field else { return Err(Error::backend("weight codec", "the model has no deformer", "Report this")) };
         let Some(range) = searched_bits(&registry.weight_codec(&self.name)?.info) else {
             return Err(Error::backend("weight codec", format!("{} has no bits to search", self.name), "Report this"));
         };
         let mut decoded = registry.build_deformer(&of.section, &of.context, device)?;
-        let before = psnr_on_views(&model.gaussians, views, &ModelServices::new(model, registry, device)?, VIEWS)?;
+        let before = psnr_on_views(&model.gaussians, judges, &ModelServices::new(model, registry, device)?, VIEWS)?;
         let mut attempt = |bits: &[f64]| {
             let mut settings = self.settings.clone();
             settings.insert(ARRAY_BITS.into(), bits.to_vec().into());
@@ -104,14 +113,15 @@ impl FieldWeights {
             let found = codec.decode(&streams, &CodecContext::new(context.seed.child("search"), context.limits, context.events))?;
             load_weights("encoded weights", decoded.as_mut(), found, device)?;
             let services = ModelServices::new(model, registry, device)?.with_deformer(decoded.as_ref());
-            let drop = before - psnr_on_views(&model.gaussians, views, &services, VIEWS)?;
+            let drop = before - psnr_on_views(&model.gaussians, judges, &services, VIEWS)?;
             Ok::<_, Error>(Attempt { streams, settings, drop })
         };
         let counts: Vec<usize> = weights.iter().map(|w| w.values.len()).collect();
         let object = format!("weight codec {}", self.name);
         let (bits, found) = search_bits(&object, &counts, range, limit, &mut attempt)?;
         let text: Vec<String> = bits.iter().map(f64::to_string).collect();
-        let message = format!("{} bits, PSNR {:.4} dB lower on {} training views ({limit} dB allowed)", text.join(", "), found.drop, views.len().min(VIEWS));
+        let (bits, number, kind) = (text.join(", "), judges.len().min(VIEWS), judges.kind());
+        let message = format!("{bits} bits, PSNR {:.4} dB lower on {number} {kind} views ({limit} dB allowed)", found.drop);
         context.events.emit(&Event::Note { object, message });
         Ok((found.streams, found.settings))
     }
@@ -148,7 +158,7 @@ impl<'a> StoredField<'a> {
 }
 
 impl FieldWeights {
-    /// The settings of the weight codec for `model`, searched on the training views of `scene` where the loss was stated. `importance` is [`FieldWeights::importance`].
+    /// The settings of the weight codec for `model`, searched on the views of `scene` that judge where the loss was stated. `importance` is [`FieldWeights::importance`].
     ///
     /// # Errors
     /// As [`Model::save_archive`].
@@ -162,8 +172,8 @@ impl FieldWeights {
         events: &dyn EventSink,
     ) -> Result<toml::Table> {
         let Some(of) = model.field.as_ref().filter(|_| self.max_drop_db.is_some()) else { return Ok(self.settings.clone()) };
-        let (views, seed) = (SceneViews::new(scene), weight_seed(model.provenance.seed));
-        let context = CodecContext { views: Some(&views), weight_importance: importance, ..CodecContext::new(seed, *limits, events) };
+        let (views, judges, seed) = (SceneViews::new(scene), SceneViews::judging(scene), weight_seed(model.provenance.seed));
+        let context = CodecContext { views: Some(&views), judges: Some(&judges), weight_importance: importance, ..CodecContext::new(seed, *limits, events) };
         Ok(self.encode(model, &weights_of(of.field.as_ref())?, Some(device), &context, registry)?.1)
     }
     /// `settings` with steps `factor` times as large, in quarters of a bit; unchanged where bits were not searched.
@@ -204,7 +214,7 @@ fn search_bits(
     let finest = vec![most; counts.len()];
     let first = attempt(&finest)?;
     if first.drop > limit {
-        let problem = format!("weights of {most} bits, the most there are, lose {:.2e} dB on training views, {limit} dB are allowed", first.drop);
+        let problem = format!("weights of {most} bits, the most there are, lose {:.2e} dB, {limit} dB are allowed", first.drop);
         return Err(Error::parameter(object, problem, "Allow more, or store the weights as fp32"));
     }
     if counts.is_empty() {
@@ -268,8 +278,16 @@ mod tests {
         assert!(tried.get() < 10, "{} attempts", tried.get());
         // Nothing is accurate enough.
         let refused = search_bits("weights", &counts, 3..=16, 1e-12, &mut attempt).err().unwrap();
-        let expected = "weights of 16 bits, the most there are, lose 4.92e-7 dB on training views, 0.000000000001 dB are allowed";
+        let expected = "weights of 16 bits, the most there are, lose 4.92e-7 dB, 0.000000000001 dB are allowed";
         assert!(matches!(refused, Error::Parameter { .. }) && refused.to_string().contains(expected), "{refused}");
+    }
+
+    #[test]
+    fn a_search_is_refused_without_a_scene() {
+        let of = |max_drop_db| FieldWeights { name: "compact".into(), settings: toml::Table::new(), max_drop_db };
+        of(None).check_without_scene().unwrap();
+        let refused = of(Some(0.01)).check_without_scene().unwrap_err().to_string();
+        assert!(["compact:max-drop=0.01dB", "--scene", "--field-weights compact:bits=6"].iter().all(|part| refused.contains(part)), "{refused}");
     }
 
     #[test]

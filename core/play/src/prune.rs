@@ -27,7 +27,7 @@ pub struct PruneReport {
     /// PSNR in dB of all Gaussians after one re-fit, nothing removed: what training alone gives. Missing without re-fit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_refit_alone_db: Option<f64>,
-    /// Which views judged: validation views where the scene has some, else training views.
+    /// Which views judged ([`Scene::judging_split`]).
     pub judged_by: Split,
     /// Number of those views.
     pub views: usize,
@@ -77,8 +77,7 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
     if !(max_drop_db > 0.0 && max_drop_db.is_finite()) {
         return Err(Error::parameter("prune", format!("a drop of {max_drop_db} dB"), "Allow a positive number of dB, such as 0.1"));
     }
-    let judged_by = if scene.split(Split::Validation).is_empty() { Split::Train } else { Split::Validation };
-    let judges = SceneViews::of(scene, judged_by);
+    let (judged_by, judges) = (scene.judging_split(), SceneViews::judging(scene));
     if SceneViews::new(scene).is_empty() || judges.is_empty() {
         return Err(Error::parameter("prune", format!("{} has no training views", scene.name), "Give the scene that the model was trained on"));
     }

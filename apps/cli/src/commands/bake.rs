@@ -7,7 +7,8 @@ use crate::shots::capture_cameras;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_core::archive::{Archive, Presentation, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Camera, Error, Event, EventSink, Result, parse_device, toml};
+use cc4dgs_core::{Camera, Error, Event, EventSink, Registry, Result, parse_device, toml};
+use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::bake::{BakeReport, MaxError};
 use cc4dgs_play::source::{Source, SourceKind};
 use serde::Serialize;
@@ -39,11 +40,11 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
     if let Some(rate) = args.fps.filter(|rate| !RATES.contains(rate)) {
         return Err(Error::parameter("--fps", format!("{rate} frames per second"), format!("Choose {} to {}", RATES.start(), RATES.end())));
     }
+    let storage = storage(args, &context.registry)?;
     let (events, device) = (context.listeners(None)?, parse_device(&args.device)?);
     create_parent(&args.out)?;
     let stop = interrupt::stop_flag()?;
     let around = Surroundings { registry: &context.registry, device: &device, limits: &context.limits, events: &events, stop };
-    let storage = storage(args)?;
     let stored = Stored::open(&args.model, storage.unwrap_or_default(), around)?;
     let cameras = match &args.scene {
         Some(scene) => capture_cameras(context, scene, &args.sets, &stored.model)?,
@@ -82,16 +83,18 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
     context.output.result(&report, || text(&report))
 }
 
-/// How the model is to be stored; `None` where it is an archive, whose streams are kept.
-fn storage(args: &Bake) -> Result<Option<Storage<'_>>> {
+/// How the model is to be stored; `None` where it is an archive, whose streams are kept. What needs a scene is refused: `--scene` gives cameras alone.
+fn storage<'a>(args: &'a Bake, registry: &Registry) -> Result<Option<Storage<'a>>> {
+    let default = Storage::default();
+    let codec = args.codec.as_deref().unwrap_or(default.codec);
+    let field_weights = args.field_weights.as_deref().unwrap_or(default.field_weights);
+    ArchiveOptions::check(codec, &toml::Table::new(), field_weights, false, registry)?;
     if Source::expect(&args.model)?.kind == SourceKind::Archive {
         let stated = args.codec.as_ref().map(|_| "--codec").or(args.field_weights.as_ref().map(|_| "--field-weights"));
         let problem = "the model is an archive, whose Gaussians and weights are kept as they are";
         return stated.map_or(Ok(None), |option| Err(Error::parameter(option, problem, "Leave it out, or bake the run that the archive was made of")));
     }
-    let default = Storage::default();
-    let codec = args.codec.as_deref().unwrap_or(default.codec);
-    Ok(Some(Storage { codec, field_weights: args.field_weights.as_deref().unwrap_or(default.field_weights) }))
+    Ok(Some(Storage { codec, field_weights }))
 }
 
 /// What the archive said already, what the cameras say, and what the options say, the last first.

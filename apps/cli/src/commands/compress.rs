@@ -7,7 +7,6 @@ use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, Presentation, StreamInfo, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
-use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_play::{ArchiveOptions, Model};
@@ -15,8 +14,8 @@ use cc4dgs_train::eval::SizeMb;
 use cc4dgs_train::train::{TuneJob, Tuner};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 /// What compression came to.
@@ -32,6 +31,8 @@ pub struct CompressReport {
     pub seconds: f64,
     /// What decoding the Gaussians of the file that was written took.
     pub decode_seconds: f64,
+    /// What was warned of while the model was stored.
+    pub warnings: Vec<String>,
     pub streams: Vec<StreamSize>,
 }
 
@@ -59,6 +60,23 @@ impl From<StreamInfo> for StreamSize {
     }
 }
 
+/// Passes events on and keeps the warnings.
+struct Warnings<'a> {
+    to: &'a dyn EventSink,
+    kept: Mutex<Vec<String>>,
+}
+
+impl EventSink for Warnings<'_> {
+    fn emit(&self, event: &Event) {
+        if let Event::Warning { object, message } = event
+            && let Ok(mut kept) = self.kept.lock()
+        {
+            kept.push(format!("{object}: {message}"));
+        }
+        self.to.emit(event);
+    }
+}
+
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
@@ -69,9 +87,8 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
         return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset that the model was trained on"));
     }
     config::set_all(&mut settings, &codec_sets)?;
-    // Unknown names and settings are refused before anything is read.
-    context.registry.build_codec(&args.codec, &settings)?;
-    FieldWeights::parse(&args.field_weights, &context.registry)?;
+    // Unknown names and settings, and what needs a scene, are refused before anything is read.
+    ArchiveOptions::check(&args.codec, &settings, &args.field_weights, args.scene.is_some(), &context.registry)?;
     let events = context.listeners(None)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     say_what_is_lost(context, &args.model, &events)?;
@@ -119,7 +136,8 @@ pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out:
     let began = Instant::now();
     create_parent(out)?;
     let object = out.display().to_string();
-    let file = model.to_archive(options, &context.registry, &context.limits, events)?;
+    let warned = Warnings { to: events, kept: Mutex::default() };
+    let file = model.to_archive(options, &context.registry, &context.limits, &warned)?;
     let (bytes, seconds) = (file.len() as u64, began.elapsed().as_secs_f64());
     let archive = Archive::from_bytes(object.clone(), file.clone(), &context.limits)?;
     let began = Instant::now();
@@ -142,6 +160,7 @@ pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out:
         ratio: model.float32_size().total as f64 / bytes.max(1) as f64,
         seconds,
         decode_seconds,
+        warnings: warned.kept.into_inner().unwrap_or_default(),
         streams: stored.into_iter().map(StreamSize::from).collect(),
     })
 }
@@ -167,4 +186,20 @@ pub fn text(report: &CompressReport) -> String {
 /// One stream for people.
 pub fn stream_line(stream: &StreamSize) -> String {
     format!("  {:<28} {:>12.6} MB stored, {:>12.6} MB decoded", stream.name, megabytes(stream.stored_bytes), megabytes(stream.decoded_bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Recorder;
+
+    #[test]
+    fn warnings_are_kept_for_the_report() {
+        let events = Recorder::default();
+        let warned = Warnings { to: &events, kept: Mutex::default() };
+        let (object, message) = (|| "codec compact".to_string(), || "the search ended".to_string());
+        let all = [Event::Note { object: object(), message: message() }, Event::Warning { object: object(), message: message() }];
+        all.iter().for_each(|event| warned.emit(event));
+        assert_eq!((events.events().as_slice(), warned.kept.into_inner().unwrap()), (&all[..], vec!["codec compact: the search ended".to_string()]));
+    }
 }

@@ -6,8 +6,8 @@ use crate::args::Prune;
 use crate::interrupt;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
+use cc4dgs_core::Result;
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Result, Split};
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::prune::{PruneReport, prune};
 use cc4dgs_train::train::{RefitJob, prune_and_refit};
@@ -53,20 +53,16 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
 
 fn text(report: &Report) -> String {
     let p = &report.prune;
-    let judges = match p.judged_by {
-        Split::Train => "training",
-        Split::Validation => "validation",
-        Split::Test => "test",
-    };
     let alone = p.psnr_refit_alone_db.map_or(String::new(), |psnr| format!(" ({psnr:.3} dB after one re-fit with nothing removed)"));
     format!(
-        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {judges} views{alone}, {:.1} s",
+        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {} views{alone}, {:.1} s",
         report.archive.display(),
         p.after,
         p.before,
         p.psnr_after_db,
         p.psnr_before_db,
         p.views,
+        p.judged_by.name(),
         report.seconds
     )
 }

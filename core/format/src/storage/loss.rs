@@ -5,6 +5,32 @@ pub fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
     if values.len() == decoded.len() { ratio(squares(values, decoded), values.len()) } else { f64::NAN }
 }
 
+/// [`relative_rms`] of values that are decoded part after part, for encoders that hold no decoded copy of them.
+#[derive(Clone, Copy, Debug)]
+pub struct PartialLoss {
+    error: f64,
+    deviation: f64,
+    count: usize,
+}
+
+impl PartialLoss {
+    /// Of `values`, of which nothing is decoded yet.
+    pub fn new(values: &[f32]) -> Self {
+        let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len().max(1) as f64;
+        let deviation = values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>();
+        Self { error: 0.0, deviation, count: values.len() }
+    }
+    /// Adds the `values` that follow those added before, and what they are decoded to.
+    pub fn add(&mut self, values: &[f32], decoded: &[f32]) {
+        // One sum over all parts, so that the result does not depend on where they end.
+        self.error = values.iter().zip(decoded).fold(self.error, |sum, (a, b)| sum + (f64::from(*a) - f64::from(*b)).powi(2));
+    }
+    /// The loss, once all values were added.
+    pub fn loss(&self) -> f64 {
+        ratio([self.error, self.deviation], self.count)
+    }
+}
+
 /// [`relative_rms`] of the values between the 5th and the 95th percentile of each component of `rows` `[N,width]`, in deviations from the mean of that
 /// component. Outliers, and components around different means, enlarge the standard deviation of a column and would hide the errors of the other values.
 pub fn central_loss(rows: &[f32], decoded: &[f32], width: usize) -> f64 {
@@ -37,9 +63,9 @@ pub fn column_loss(name: &str, rows: &[f32], decoded: &[f32], width: usize) -> f
 
 /// The sums of squared errors and of squared deviations from the mean.
 fn squares(values: &[f32], decoded: &[f32]) -> [f64; 2] {
-    let error = values.iter().zip(decoded).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>();
-    let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len().max(1) as f64;
-    [error, values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>()]
+    let mut sums = PartialLoss::new(values);
+    sums.add(values, decoded);
+    [sums.error, sums.deviation]
 }
 
 /// The root-mean-square error over the standard deviation, of the sums of `count` values.
@@ -69,5 +95,18 @@ mod tests {
         // What cannot be compared is within no bound.
         assert!(column_loss("means", &rows, &rows[3..], 3).is_nan() && column_loss("means", &[1.0; 3], &[f32::NAN; 3], 3).is_nan());
         assert_eq!(column_loss("means", &[], &[], 3), 0.0);
+    }
+
+    #[test]
+    fn parts_lose_what_the_whole_loses() {
+        let values: Vec<f32> = (0..999).map(|i| (i as f32 * 0.37).sin()).collect();
+        let decoded: Vec<f32> = values.iter().map(|v| (v * 7.0).round() / 7.0).collect();
+        let whole = relative_rms(&values, &decoded);
+        for part in [1, 10, 333, 2000] {
+            let mut sums = PartialLoss::new(&values);
+            values.chunks(part).zip(decoded.chunks(part)).for_each(|(values, decoded)| sums.add(values, decoded));
+            assert!(whole > 0.05 && sums.loss().to_bits() == whole.to_bits(), "parts of {part}: {} and {whole}", sums.loss());
+        }
+        assert_eq!(PartialLoss::new(&[]).loss(), 0.0);
     }
 }

@@ -19,7 +19,8 @@ const FRESH_MOVES: f64 = 2.0;
 /// - It minimises a quadratic function.
 /// - Rows that are not visible keep values and state.
 /// - Selected rows take over the state of their parents; fresh rows move about as fast as they.
-/// - After a restart it takes the same steps as a new optimizer; after storing and restoring state, the same steps as without.
+/// - After a restart it takes the same steps as a new optimizer, and arrays that are not named keep their state, also where their names begin alike; after
+///   storing and restoring state, it takes the same steps as without.
 /// - Invalid state is an error.
 pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
@@ -32,6 +33,7 @@ pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Devi
             ("rows", Box::new(|| suite.rows_follow_their_parents())),
             ("fresh rows", Box::new(|| suite.fresh_rows_keep_pace())),
             ("state", Box::new(|| suite.state_continues())),
+            ("restart", Box::new(|| suite.restarts_what_is_named())),
         ],
     )
 }
@@ -152,5 +154,25 @@ impl Suite<'_> {
         }
         state.arrays.remove(&name);
         Ok(self.build()?.restore(state).is_ok().then(|| format!("state without '{name}' was accepted")))
+    }
+    fn restarts_what_is_named(&self) -> Result<Option<String>> {
+        let (named, other) = ("gaussians/life", "gaussians/life_gate");
+        let mut whole = self.build()?;
+        for name in [named, other, named, other] {
+            whole.step(name, self.start(), self.start(), &StepSettings::new(0.02))?;
+        }
+        let mut restarted = self.build()?;
+        restarted.restore(whole.state())?;
+        restarted.restart(named);
+        let step = |optimizer: &mut dyn Optimizer, name: &str| {
+            // The gradient is another one than before, so that the step depends on the state.
+            let stepped = optimizer.step(name, self.start(), self.start().mul_scalar(0.5), &StepSettings::new(0.02))?;
+            to_vec(stepped, "values")
+        };
+        if step(restarted.as_mut(), named)? != step(self.build()?.as_mut(), named)? {
+            return Ok(Some(format!("after a restart of '{named}' it takes other steps than a new optimizer")));
+        }
+        let kept = step(restarted.as_mut(), other)? == step(whole.as_mut(), other)?;
+        Ok((!kept).then(|| format!("a restart of '{named}' changes the steps of '{other}'")))
     }
 }

@@ -24,7 +24,7 @@ const GAUSSIAN_RATE: f64 = 0.5;
 const DEFORMER_RATE: f64 = 0.3;
 
 /// Removes Gaussians of `job.model` in rounds, each followed by `iterations` of training, as long as the PSNR stays within `max_drop_db` of what it was, on
-/// validation views where the scene has some, else on training views. Returns the Gaussians and weights of the last round that did, and what it came to; what
+/// the views that judge ([`Scene::judging_split`]). Returns the Gaussians and weights of the last round that did, and what it came to; what
 /// one re-fit gives by itself, with nothing removed, is measured too. A round that fails is the last, and the ones before are kept where they removed some.
 ///
 /// # Errors
@@ -33,8 +33,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
     if !(max_drop_db > 0.0 && max_drop_db.is_finite()) {
         return Err(Error::parameter("prune", format!("a drop of {max_drop_db} dB"), "Allow a positive number of dB, such as 0.1"));
     }
-    let judged_by = if scene.split(Split::Validation).is_empty() { Split::Train } else { Split::Validation };
-    let before = model.gaussians.len();
+    let (judged_by, before) = (scene.judging_split(), model.gaussians.len());
     let seed = Seed::root(model.provenance.seed).child("refit");
     // By the colours that the model has before anything is removed.
     let targets = job.tuner(model, scene).targets()?.clone();

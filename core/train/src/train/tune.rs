@@ -213,10 +213,9 @@ impl<'a> Tuner<'a> {
     }
 }
 
-/// The views on which PSNR is measured: validation views where the scene has some, else training views.
+/// The views on which PSNR is measured: some of those that judge ([`Scene::judging_split`]).
 pub(super) fn judges(scene: &Scene) -> Vec<usize> {
-    let validation = scene.split(Split::Validation);
-    spread_views(scene, &if validation.is_empty() { scene.split(Split::Train) } else { validation }, JUDGES)
+    spread_views(scene, &scene.split(scene.judging_split()), JUDGES)
 }
 
 /// What changes slowly.

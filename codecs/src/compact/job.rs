@@ -1,0 +1,149 @@
+//! Gaussians in the steps of a quality: rounded, restored and coded, as often as the search for the quality asks for it.
+
+use super::LOSSES;
+use super::colors::Codes;
+use super::columns::Columns;
+use super::encode::Integers;
+use super::joint::Directions;
+use super::plan::{Bounds, Factors, Plan, Planner};
+use super::restore::{losses, restored};
+use super::write::{self, Motion};
+use cc4dgs_format::{Error, HostGaussians, Result, Stream};
+use rayon::prelude::*;
+use std::cell::Cell;
+
+/// Reductions of a column's largest step until its loss is allowed; then the whole column is stored exactly.
+const REDUCTIONS: usize = 12;
+/// The share of the declared loss that a smaller step aims at, and by how much steps become smaller at a time: errors grow in proportion to steps where these
+/// are small.
+const LOSS_AIM: f64 = 0.9;
+const SMALLER: std::ops::RangeInclusive<f64> = 0.02..=0.5;
+
+/// What does not change from one attempt to the next.
+pub struct Job<'a> {
+    /// Of the Gaussians to encode.
+    pub planner: Planner<'a>,
+    pub free: Vec<bool>,
+    /// From where Gaussians are seen, where colours are rounded together.
+    pub directions: Option<&'a Directions>,
+    /// The layer of each Gaussian, and how many each layer has.
+    pub layers: (Vec<u8>, Vec<usize>),
+    pub motion: Motion,
+    /// Of the columns, to start with.
+    pub factors: Factors,
+    /// Whether colours are rounded together: not any more once that has exceeded the declared loss, so that attempts can be compared.
+    pub joint: Cell<bool>,
+}
+
+#[cfg(test)]
+thread_local! {
+    /// How often this thread has quantised the Gaussians of a [`Job`], and how often it has coded them.
+    pub static QUANTISED: Cell<usize> = const { Cell::new(0) };
+    pub static CODED: Cell<usize> = const { Cell::new(0) };
+}
+
+/// How Gaussians are rounded in the steps of a quality.
+pub struct Attempt {
+    pub quality: f64,
+    /// Of the columns.
+    factors: Factors,
+    /// Whether colours might be rounded together when it began.
+    joint: bool,
+    pub plan: Plan,
+}
+
+impl Job<'_> {
+    /// Rounds the Gaussians to encode; with what they will be decoded to ([`Job::restored`]).
+    pub fn attempt(&self, quality: f64) -> Result<(Attempt, HostGaussians)> {
+        let gaussians = self.planner.gaussians;
+        self.attempt_with(&self.planner, quality, &self.factors, |of| Ok(in_order(&of, gaussians, &self.order(&of))))
+    }
+    /// Rounds the Gaussians of `planner` and codes them.
+    pub fn coded(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<(Attempt, Vec<Stream>)> {
+        self.attempt_with(planner, quality, factors, |of| self.write(planner.gaussians, of))
+    }
+    /// Rounds the Gaussians to encode and codes them; with what they will be decoded to.
+    pub fn coded_and_restored(&self, quality: f64, factors: &Factors) -> Result<(Vec<Stream>, HostGaussians)> {
+        let gaussians = self.planner.gaussians;
+        Ok(self.attempt_with(&self.planner, quality, factors, |of| self.written_and_restored(gaussians, of))?.1)
+    }
+    /// Rounds the Gaussians of `planner` in steps that keep the declared loss; `work` gets their integers.
+    fn attempt_with<T>(&self, planner: &Planner, quality: f64, factors: &Factors, work: impl FnOnce(Integers) -> Result<T>) -> Result<(Attempt, T)> {
+        let joint = self.joint.get();
+        let (mut bounds, mut before) = (Bounds { joint, ..Bounds::NONE }, None);
+        // Colours may be rounded apart, and each column be stored exactly in the end.
+        for reductions in 0..REDUCTIONS + 2 + factors.len() {
+            let plan = planner.plan(quality, factors, &bounds);
+            let of = self.quantise(planner.gaussians, &plan, before.take());
+            let (together, mut kept) = (bounds.joint && self.directions.is_some(), true);
+            for ((&(name, allowed), lost), factor) in LOSSES.iter().zip(losses(&of, planner.gaussians, planner.rest)).zip(&mut bounds.largest) {
+                // A small part of it is left for what rounding adds.
+                if lost.is_nan() || lost > 0.999 * allowed {
+                    kept = false;
+                    if together && name.starts_with("sh_") {
+                        bounds.joint = false;
+                        self.joint.set(false);
+                        continue;
+                    }
+                    let smaller = (LOSS_AIM * allowed / lost).clamp(*SMALLER.start(), *SMALLER.end());
+                    *factor *= if reductions < REDUCTIONS && lost.is_finite() { smaller } else { 0.0 };
+                }
+            }
+            if kept {
+                let found = work(of)?;
+                return Ok((Attempt { quality, factors: *factors, joint, plan }, found));
+            }
+            // Most columns keep their steps.
+            let colors = of.into_colors();
+            before = Some((plan, colors));
+        }
+        Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
+    }
+    /// Whether `attempt`, of the Gaussians to encode, is what would come of another with this quality and these factors.
+    pub fn repeats(&self, attempt: &Attempt, quality: f64, factors: &Factors) -> bool {
+        attempt.quality == quality && attempt.factors == *factors && attempt.joint == self.joint.get()
+    }
+    /// The integers of canonical Gaussians; `before` are the codes of their colours with another plan of the same planner.
+    pub fn quantise<'a>(&'a self, gaussians: Columns, plan: &'a Plan, before: Option<(Plan, Vec<Codes>)>) -> Integers<'a> {
+        #[cfg(test)]
+        QUANTISED.set(QUANTISED.get() + 1);
+        let colors = plan.color_codes(gaussians, self.planner.classes, self.directions, before);
+        plan.quantise(gaussians, &self.free, self.planner.classes, colors)
+    }
+    /// The streams of canonical Gaussians as `plan` rounds them.
+    pub fn streams(&self, gaussians: Columns, plan: &Plan) -> Result<Vec<Stream>> {
+        self.write(gaussians, self.quantise(gaussians, plan, None))
+    }
+    /// What they will be decoded to, in the order in which they are stored, which decides images where depths are equal. Dynamic scores, and attributes that
+    /// are stored as their plug-ins allow, are the originals.
+    pub fn restored(&self, gaussians: Columns, plan: &Plan) -> HostGaussians {
+        let of = self.quantise(gaussians, plan, None);
+        in_order(&of, gaussians, &self.order(&of))
+    }
+    /// [`Job::streams`] and [`Job::restored`].
+    pub fn stored(&self, gaussians: Columns, plan: &Plan) -> Result<(Vec<Stream>, HostGaussians)> {
+        self.written_and_restored(gaussians, self.quantise(gaussians, plan, None))
+    }
+    fn written_and_restored(&self, gaussians: Columns, of: Integers) -> Result<(Vec<Stream>, HostGaussians)> {
+        let rounded = in_order(&of, gaussians, &self.order(&of));
+        Ok((self.write(gaussians, of)?, rounded))
+    }
+    /// The streams of `gaussians`, whose integers are `of`.
+    fn write(&self, gaussians: Columns, of: Integers) -> Result<Vec<Stream>> {
+        #[cfg(test)]
+        CODED.set(CODED.get() + 1);
+        let order = self.order(&of);
+        write::write(gaussians, of, &self.motion, &order, &self.layers.1)
+    }
+    /// The order in which rows are stored.
+    pub fn order(&self, of: &Integers) -> Vec<usize> {
+        let (mut order, layers): (Vec<usize>, _) = ((0..of.keys.len()).collect(), &self.layers.0);
+        order.par_sort_unstable_by_key(|&i| (layers[i], of.keys[i], i));
+        order
+    }
+}
+
+/// What the integers of `given` stand for, in this order.
+fn in_order(of: &Integers, given: Columns, order: &[usize]) -> HostGaussians {
+    restored(of, given).into_selected(order)
+}

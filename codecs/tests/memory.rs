@@ -1,0 +1,73 @@
+//! How much memory `compact` takes while it encodes. A program of its own, because it counts every allocation.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
+
+use cc4dgs_format::gaussians::sh_rest_len;
+use cc4dgs_format::{CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Seed, Silent, toml};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Counts the bytes that are allocated, and the most that were.
+struct Counting;
+
+static NOW: AtomicUsize = AtomicUsize::new(0);
+static MOST: AtomicUsize = AtomicUsize::new(0);
+
+fn add(bytes: usize) {
+    MOST.fetch_max(NOW.fetch_add(bytes, Ordering::Relaxed) + bytes, Ordering::Relaxed);
+}
+
+// SAFETY: every call is passed on to the system allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        add(layout.size());
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        add(layout.size());
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        NOW.fetch_sub(layout.size(), Ordering::Relaxed);
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        add(size);
+        NOW.fetch_sub(layout.size(), Ordering::Relaxed);
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Gaussians of degree 3 whose coefficients all have codes.
+fn scene(count: usize) -> HostGaussians {
+    let draw = |k: usize, column: usize| (Seed::root(column as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+    let mut g = HostGaussians { sh_degree: 3, opacity_logits: vec![0.0; count], ..Default::default() };
+    for (column, (name, width, values)) in g.columns_mut().into_iter().enumerate() {
+        let shift = if name == "log_scales" { -5.0 } else { 0.0 };
+        *values = (0..count * width).map(|k| shift + draw(k, column)).collect();
+    }
+    g
+}
+
+#[test]
+fn encoding_takes_at_most_twice_the_memory_of_the_model_beside_it() {
+    cc4dgs_codecs::link();
+    let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)("", &toml::Table::new()).unwrap();
+    // Over the number from which there are layers; buffers of blocks are small beside it.
+    let count = 140_000;
+    let g = scene(count);
+    let model = 4 * count * (15 + 3 * sh_rest_len(3));
+    let context = CodecContext { dynamic_threshold: Some(f32::INFINITY), ..CodecContext::new(Seed::root(3), Limits::default(), &Silent) };
+    let before = NOW.load(Ordering::Relaxed);
+    MOST.store(before, Ordering::Relaxed);
+    let streams = codec.encode(&g, &context).unwrap();
+    let most = MOST.load(Ordering::Relaxed) - before;
+    assert!(streams.iter().map(|s| s.bytes.len()).sum::<usize>() > 20 * count, "the test has nothing to show");
+    assert!(most <= 2 * model, "{most} bytes beside a model of {model}");
+}
