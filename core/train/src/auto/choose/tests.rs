@@ -62,8 +62,10 @@ fn scenes_get_what_they_need_and_no_more() {
     let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
     let odd = chosen(&odd, MACHINE, 5.0, None);
     assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
-    let growth = |minutes: f64| value(&chosen(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, None), "train.image_growth");
-    assert_eq!((growth(5.0), growth(30.0)), (Some(0.5.into()), Some(0.0.into())));
+    let growth = |arrangement, minutes: f64| value(&chosen(&facts(arrangement), MACHINE, minutes, None), "train.image_growth");
+    for arrangement in [Arrangement::OneCameraAnywhere, Arrangement::Dome, Arrangement::Rig] {
+        assert_eq!((growth(arrangement, 5.0), growth(arrangement, 30.0)), (Some(0.5.into()), Some(0.0.into())));
+    }
     let stored = |minutes: f64, key: &str| value(&chosen(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, None), key);
     assert_eq!((stored(5.0, "deformer.kind"), stored(5.0, "deformer.log2_rows")), (Some("hash-basis".into()), Some(13.into())));
     assert_eq!((stored(90.0, "deformer.log2_rows"), stored(90.0, "deformer.cycles")), (Some(15.into()), Some(0.5.into())));
