@@ -13,7 +13,7 @@ stores it. The same program on the same kind of machine gives the same bytes. Th
 import argparse, hashlib, json, pathlib, subprocess, sys, tempfile, time
 from trainings import begin, ended, replace, sha256, trained
 
-SCENES = {"mutant-12k": "dnerf_mutant", "mutant-40k": "dnerf_mutant", "basketball": "panoptic_basketball", "built-in": None}
+SCENES = {"mutant-12k": "dnerf_mutant", "mutant-24k": "dnerf_mutant", "mutant-40k": "dnerf_mutant", "basketball": "panoptic_basketball", "built-in": None}
 CONFIGURATIONS = pathlib.Path(__file__).resolve().parent / "models"
 
 
