@@ -29,7 +29,7 @@ const BIT: f64 = 0.1155;
 /// Largest share of a step by which a coordinate is rounded towards zero.
 const FARTHEST: f64 = 0.4;
 /// Most coefficients times channels of a degree: those of degree 4.
-const MOST_DIMS: usize = 27;
+const MOST_DIMS: usize = 3 * (2 * 4 + 1);
 
 /// The coefficients of one degree, all channels.
 #[derive(PartialEq)]

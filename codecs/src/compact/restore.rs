@@ -26,8 +26,8 @@ pub fn restored(of: &Integers, given: Columns) -> HostGaussians {
     }
 }
 
-/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`]). They are not all in memory at a time; `rest` is the
-/// loss of the higher degrees before any is decoded.
+/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`]). Each thread has one of them in memory, and of the
+/// higher degrees a block of rows; `rest` is the loss of these before any is decoded.
 pub fn losses(of: &Integers, given: Columns, rest: PartialLoss) -> Vec<f64> {
     let loss = |column: usize| match column {
         0 => column_loss("means", given.means, &of.means(given.means), 3),

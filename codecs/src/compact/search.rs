@@ -79,7 +79,7 @@ struct Tried {
     share: f64,
     /// Where it was coded.
     streams: Option<Vec<Stream>>,
-    /// Whether no attempt was left when it was chosen, and none was good enough.
+    /// Whether no attempt was left when it was chosen, none was good enough, and another might be better: a size may be more than the finest steps fill.
     last: bool,
 }
 
@@ -125,7 +125,7 @@ fn seek(job: &Job, start: f64, mut first: Option<Tried>, allowance: &Allowance, 
         };
     }
     match best.map(|(_, tried)| tried).or(least) {
-        Some(tried) => Ok(Tried { last: true, ..tried }),
+        Some(tried) => Ok(Tried { last: refused.is_finite() || matches!(allowance, Allowance::Drop { .. }), ..tried }),
         None => Err(Error::backend("codec compact", "no step factor was tried", "Report this")),
     }
 }

@@ -53,7 +53,7 @@ impl<'a> CodecContext<'a> {
     /// The views on which a loss of PSNR is measured: validation views where the scene has some, else those that the model was trained on. `None` where there are
     /// no views.
     pub fn judging_views(&self) -> Option<&'a dyn TrainingViews> {
-        self.judges.or(self.views).filter(|views| !views.is_empty())
+        self.judges.into_iter().chain(self.views).find(|views| !views.is_empty())
     }
 }
 

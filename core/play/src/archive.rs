@@ -42,7 +42,7 @@ pub struct ArchiveOptions<'a> {
 
 impl ArchiveOptions<'_> {
     /// Refuses codecs and settings that do not exist, and where there is no scene, those that need one. Call it before anything is read;
-    /// [`Model::to_archive`] refuses the same.
+    /// [`Model::to_archive`] refuses the same, but for `field_weights` where the model has no deformer.
     ///
     /// # Errors
     /// [`Error::Parameter`] that names the codec or setting and the remedy.

@@ -11,6 +11,7 @@ pub struct PartialLoss {
     error: f64,
     deviation: f64,
     count: usize,
+    added: usize,
 }
 
 impl PartialLoss {
@@ -18,16 +19,20 @@ impl PartialLoss {
     pub fn new(values: &[f32]) -> Self {
         let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len().max(1) as f64;
         let deviation = values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>();
-        Self { error: 0.0, deviation, count: values.len() }
+        Self { error: 0.0, deviation, count: values.len(), added: 0 }
     }
     /// Adds the `values` that follow those added before, and what they are decoded to.
     pub fn add(&mut self, values: &[f32], decoded: &[f32]) {
         // One sum over all parts, so that the result does not depend on where they end.
         self.error = values.iter().zip(decoded).fold(self.error, |sum, (a, b)| sum + (f64::from(*a) - f64::from(*b)).powi(2));
+        self.added += values.len();
+        if values.len() != decoded.len() {
+            self.error = f64::NAN;
+        }
     }
-    /// The loss, once all values were added.
+    /// The loss, once all values were added; NaN before, and where a part had another length than what it is decoded to.
     pub fn loss(&self) -> f64 {
-        ratio([self.error, self.deviation], self.count)
+        if self.added == self.count { ratio([self.error, self.deviation], self.count) } else { f64::NAN }
     }
 }
 
@@ -108,5 +113,11 @@ mod tests {
             assert!(whole > 0.05 && sums.loss().to_bits() == whole.to_bits(), "parts of {part}: {} and {whole}", sums.loss());
         }
         assert_eq!(PartialLoss::new(&[]).loss(), 0.0);
+        // What was not compared is within no bound.
+        let mut sums = PartialLoss::new(&values);
+        sums.add(&values[..10], &decoded[..10]);
+        assert!(sums.loss().is_nan());
+        sums.add(&values[10..], &decoded[11..]);
+        assert!(sums.loss().is_nan());
     }
 }
