@@ -7,6 +7,7 @@
 
 use super::folder::write_settings;
 use super::{Context, TrainState};
+use crate::schedule::StageLengths;
 use crate::train_config::{LEAST_ITERATIONS, LEAST_STRETCH, MOST_STRETCH};
 use cc4dgs_core::{Event, Result, Schedule, Stage};
 use std::time::Instant;
@@ -26,6 +27,11 @@ const LATER: f64 = 0.94;
 /// How much longer than now an iteration takes on average, when there are `now` Gaussians and will be at most `most`.
 pub(crate) fn growth(now: usize, most: usize) -> f64 {
     (MEAN_GAUSSIANS * most as f64 / now.max(1) as f64).max(1.0).powf(GROWTH_POWER)
+}
+
+/// How many iterations are timed together, so few that some fit between those with smaller images and the one that settles the length.
+fn timed_together(lengths: &StageLengths) -> usize {
+    (lengths.settles_at().saturating_sub(lengths.timed_after()) / 3).clamp(1, TOGETHER)
 }
 
 /// The least factor by which a main stage of `main` iterations may be stretched, in a run of `total`.
@@ -51,7 +57,7 @@ impl Pace {
     /// To be called after every iteration: the factor by which the main stage is to be stretched, once it is known.
     pub fn after_iteration(&mut self, context: &Context, schedule: &Schedule, gaussians: usize) -> Option<f64> {
         let (last, iteration) = (context.lengths.settles_at(), schedule.iteration);
-        let together = (last / 6).clamp(1, TOGETHER);
+        let together = timed_together(&context.lengths);
         if iteration.is_multiple_of(together) && iteration <= last {
             let now = Instant::now();
             if let Some(since) = self.since.replace(now).filter(|_| iteration >= context.lengths.timed_after() + together) {
@@ -92,6 +98,7 @@ impl Context<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::TrainConfig;
 
     #[test]
     fn what_happens_once_is_not_counted() {
@@ -106,6 +113,18 @@ mod tests {
         assert_eq!((least_stretch(60, 43), least_stretch(LEAST_ITERATIONS, 225)), (1.0, 1.0));
         assert!((30.0 + 270.0 * least_stretch(300, 270) - LEAST_ITERATIONS as f64).abs() < 1e-9);
         assert_eq!(least_stretch(500, 0), LEAST_STRETCH);
+    }
+
+    #[test]
+    fn every_run_times_iterations_before_its_length_is_settled() {
+        for (shares, image_growth) in [([5.0, 3.0, 20.0], 0.5), ([5.0, 3.0, 20.0], 0.0), ([2.0, 0.0, 18.0], 0.5), ([1.0, 0.0, 4.0], 0.0)] {
+            for iterations in 250..3000 {
+                let lengths = StageLengths::new(&TrainConfig { iterations, shares, image_growth, ..Default::default() }, true, 1.0);
+                let (last, together) = (lengths.settles_at(), timed_together(&lengths));
+                let latest = last / together * together;
+                assert!(latest >= lengths.timed_after() + together, "{iterations} iterations, shares {shares:?}, growth {image_growth}");
+            }
+        }
     }
 
     #[test]
