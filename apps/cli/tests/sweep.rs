@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{cc4dgs, fail, json_of, run, said, text};
+use common::{cc4dgs, fail, json_of, read_json, run, said, text};
 use serde_json::Value;
 use std::path::Path;
 
@@ -259,10 +259,13 @@ fn job_files_are_printed() {
         assert!(output.status.success() && file.contains(expected) && file.contains(text(&out)) && file.contains("sweep"), "{file}");
     }
     assert!(fail(&["sweep", "emit", "pbs", text(&out)], 2).contains("slurm"));
+    let hash = || read_json(&out.join("plan.json"))["trainings"][0]["data"]["hash"].as_str().unwrap().to_string();
+    let stated = hash();
     // Pods do not have the variables of this machine.
     std::fs::write(&grid, GRID.replace("procedural:tiny", "$CC4DGS_SCENE")).unwrap();
     let planned = cc4dgs().env("CC4DGS_SCENE", "procedural:tiny").args(["sweep", "plan", text(&grid), "--out", text(&out), "-q"]).output().unwrap();
     assert!(planned.status.success(), "{}", said(&planned));
+    assert_eq!(hash(), stated, "the scene counts, not the variable that names it");
     assert!(fail(&["sweep", "emit", "k8s", text(&out)], 2).contains("--env CC4DGS_SCENE=DIR"));
     let output = run(&["sweep", "emit", "k8s", text(&out), "--env", "CC4DGS_SCENE=procedural:tiny"]);
     let file = String::from_utf8_lossy(&output.stdout);

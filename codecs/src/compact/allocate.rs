@@ -18,7 +18,7 @@ const CHANGE: f64 = 2.0;
 const LARGEST: f64 = 8.0;
 
 /// The factors of the columns at about the step factor `quality`. `known` are the plan and the bytes without factors, where these have been found before;
-/// `whole` are the Gaussians to encode.
+/// `whole` are the Gaussians to encode, as renderers take them.
 pub fn allocate(
     job: &Job,
     quality: f64,

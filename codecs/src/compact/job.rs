@@ -60,7 +60,10 @@ impl Job<'_> {
     }
     /// Rounds the Gaussians of `planner` and codes them.
     pub fn coded(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<(Attempt, Vec<Stream>)> {
-        self.attempt_with(planner, quality, factors, |of| self.write(planner.gaussians, of))
+        self.attempt_with(planner, quality, factors, |of| {
+            let order = self.order(&of);
+            self.write(planner.gaussians, of, &order)
+        })
     }
     /// Rounds the Gaussians to encode and codes them; with what they will be decoded to.
     pub fn coded_and_restored(&self, quality: f64, factors: &Factors) -> Result<(Vec<Stream>, HostGaussians)> {
@@ -112,7 +115,9 @@ impl Job<'_> {
     }
     /// The streams of canonical Gaussians as `plan` rounds them.
     pub fn streams(&self, gaussians: Columns, plan: &Plan) -> Result<Vec<Stream>> {
-        self.write(gaussians, self.quantise(gaussians, plan, None))
+        let of = self.quantise(gaussians, plan, None);
+        let order = self.order(&of);
+        self.write(gaussians, of, &order)
     }
     /// What they will be decoded to, in the order in which they are stored, which decides images where depths are equal. Dynamic scores, and attributes that
     /// are stored as their plug-ins allow, are the originals.
@@ -125,15 +130,15 @@ impl Job<'_> {
         self.written_and_restored(gaussians, self.quantise(gaussians, plan, None))
     }
     fn written_and_restored(&self, gaussians: Columns, of: Integers) -> Result<(Vec<Stream>, HostGaussians)> {
-        let rounded = in_order(&of, gaussians, &self.order(&of));
-        Ok((self.write(gaussians, of)?, rounded))
+        let order = self.order(&of);
+        let rounded = in_order(&of, gaussians, &order);
+        Ok((self.write(gaussians, of, &order)?, rounded))
     }
-    /// The streams of `gaussians`, whose integers are `of`.
-    fn write(&self, gaussians: Columns, of: Integers) -> Result<Vec<Stream>> {
+    /// The streams of `gaussians`, whose integers are `of`, in their [`Job::order`].
+    fn write(&self, gaussians: Columns, of: Integers, order: &[usize]) -> Result<Vec<Stream>> {
         #[cfg(test)]
         CODED.set(CODED.get() + 1);
-        let order = self.order(&of);
-        write::write(gaussians, of, &self.motion, &order, &self.layers.1)
+        write::write(gaussians, of, &self.motion, order, &self.layers.1)
     }
     /// The order in which rows are stored.
     pub fn order(&self, of: &Integers) -> Vec<usize> {

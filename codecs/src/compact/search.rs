@@ -145,7 +145,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     if !by_size && (services.is_none() || settings.max_drop_db <= 0.0) {
         return Ok(job.coded(&job.planner, start, &job.factors)?.1);
     }
-    // Images are drawn of whole Gaussians.
+    // Renderers take `HostGaussians`; this copy is made once.
     let whole = services.map(|_| gaussians.to_host());
     let services = services.zip(whole.as_ref());
     let allowance = match services {
@@ -190,7 +190,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             // It was good enough to be corrected.
             if found.share < GOOD {
                 let start = found.attempt.quality;
-                let first = Some(found).filter(|found| job.repeats(&found.attempt, start, &plain));
+                let first = Some(Tried { streams: Some(streams), ..found }).filter(|found| job.repeats(&found.attempt, start, &plain));
                 found = seek(job, start, first, &allowance, GOOD)?;
                 streams = found.coded(job)?;
             }

@@ -46,7 +46,7 @@ pub struct TrainConfig {
     /// Length of the main stage from its first fifth on, or later where `image_growth` asks for it, as a multiple of its share: runs that `auto` plans for a
     /// time find it when they have timed what is before.
     pub stretch: f64,
-    /// Views per iteration.
+    /// The most views of an iteration.
     pub batch: usize,
     /// Views per iteration of the coarse stage, where no spatial pass is shared; 0 is as many as `batch`.
     pub coarse_batch: usize,
@@ -285,12 +285,12 @@ impl TrainConfig {
         }
         Ok(())
     }
-    /// Views per iteration of `stage`, where there are so many.
+    /// The most views of an iteration of `stage`: there are fewer where the scene, or what `time_ramp` has opened of it, has fewer.
     pub fn views_per_iteration(&self, stage: Stage) -> usize {
         if stage == Stage::Coarse && self.coarse_batch > 0 { self.coarse_batch } else { self.batch }
     }
-    /// What every learning rate of an iteration is multiplied by, whose loss is the mean over so many `views`. Where a trained model is trained further, rates
-    /// are shares of those of its training, and the views per iteration of that count.
+    /// The factor of every learning rate of an iteration whose loss is the mean over this number of `views`. Where a trained model is trained further, the
+    /// number of views that its configuration states counts.
     pub fn rate_scale(&self, schedule: &Schedule, views: usize) -> f64 {
         let views = if schedule.trained { self.views_per_iteration(schedule.stage) } else { views };
         let of_batch = (views as f64).powf(self.lr.batch_power);

@@ -9,8 +9,8 @@ use std::collections::BTreeMap;
 pub const INTERRUPTED: u8 = 130;
 /// Exit codes after which the same command would fail again: wrong request, wrong data, hopeless training.
 const FINAL: [u8; 3] = [2, 3, 6];
-/// Variables that tell a job the index of its training.
-const INDEX_VARIABLES: [&str; 3] = ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "INDEX"];
+/// Variables that tell a job which training it is.
+const INDEX_VARIABLES: [&str; 4] = ["SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "INDEX"];
 /// Seconds before a time limit at which a job is asked to stop.
 const NOTICE_SECONDS: u32 = 120;
 
@@ -98,7 +98,7 @@ fn variables(scheduler: Scheduler, plan: &Plan, stated: &[String]) -> Result<BTr
     for text in stated {
         let object = format!("--env {text}");
         let Some((name, value)) = text.split_once('=').filter(|(_, value)| !value.is_empty()) else {
-            return Err(Error::parameter(object, "it is not NAME=VALUE", "Write for instance --env CC4DGS_DATA=/data"));
+            return Err(Error::parameter(object, "it is not NAME=VALUE with a value", "Write for instance --env CC4DGS_DATA=/data"));
         };
         if INDEX_VARIABLES.contains(&name) {
             return Err(Error::parameter(object, "jobs read the index of their training from this variable", "Leave it out"));
@@ -211,8 +211,9 @@ exit "$code"
 
 fn kubernetes(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
     let parallel = if o.parallel > 0 { o.parallel } else { plan.trainings.len() };
-    // Kubernetes replaces $(NAME) in values, and $$ by $.
-    let variable = |(name, value): (&String, &String)| format!("        - name: {}\n          value: {}\n", yaml(name), yaml(&value.replace('$', "$$")));
+    // Kubernetes replaces $(NAME) in commands, their arguments and values of variables, and $$ by $.
+    let literal = |text: &str| yaml(&text.replace('$', "$$"));
+    let variable = |(name, value): (&String, &String)| format!("        - name: {}\n          value: {}\n", yaml(name), literal(value));
     format!(
         r#"# {trainings} trainings, {cells} cells. Submit with: kubectl apply -f FILE. Interrupted and evicted pods, and pods at their time limit, are replaced
 # and go on from the checkpoint; codes after which the same command would fail again end their index only. Needs Kubernetes 1.33, or 1.29 with its defaults.
@@ -277,9 +278,9 @@ spec:
         finals = FINAL.map(|code| code.to_string()).join(", "),
         image = yaml(&o.image),
         cd = yaml(&o.working_folder),
-        program = yaml(&o.program),
-        limits = o.limits.iter().map(|limit| format!("\"--limit\", {}, ", yaml(limit))).collect::<String>(),
-        folder = yaml(&o.folder),
+        program = literal(&o.program),
+        limits = o.limits.iter().map(|limit| format!("\"--limit\", {}, ", literal(limit))).collect::<String>(),
+        folder = literal(&o.folder),
         variables = variables.iter().map(variable).collect::<String>(),
         threads = o.threads,
         memory = u64::from(o.memory_gb) * 1000,

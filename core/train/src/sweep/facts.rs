@@ -141,7 +141,8 @@ pub fn fingerprint(text: &str, registry: &Registry) -> Result<DataFingerprint> {
     }
     let mut hash = ContentHash::default();
     if !path.exists() {
-        hash.part(text.as_bytes());
+        // A built-in scene, which a variable may name.
+        hash.part(path.to_string_lossy().as_bytes());
         return Ok(DataFingerprint { path: text.into(), hash: hash.name(), files: 0, bytes: 0 });
     }
     let files = files_of(&path)?;

@@ -172,7 +172,7 @@ fn indices_reach_the_program() {
     let container = &value["spec"]["template"]["spec"]["containers"][0];
     let arguments: Vec<&str> = container["args"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
     let id = plan().id();
-    assert_eq!(arguments, ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--plan", &id, "--index", "$(JOB_COMPLETION_INDEX)"]);
+    assert_eq!(arguments, ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $$(test)", "--plan", &id, "--index", "$(JOB_COMPLETION_INDEX)"]);
     let slurm = emit(Scheduler::Slurm, &plan(), &EmitOptions { parallel: 3, ..options() }).unwrap();
     assert!(slurm.contains("#SBATCH --array=0-0%3\n") && slurm.contains(&format!("--plan {id} --index \"$SLURM_ARRAY_TASK_ID\"")), "{slurm}");
     let sky = emit(Scheduler::SkyPilot, &plan(), &options()).unwrap();
