@@ -1,8 +1,11 @@
 //! From what is known of a scene and a machine to settings, each with its reason.
 
+mod stages;
+
 use super::facts::{Arrangement, Facts};
 use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::SceneOptions;
+use stages::stages;
 use toml::Value;
 
 /// Pixels per image that a thread can train on in a minute and still see every part of the scene a few hundred times.
@@ -36,7 +39,7 @@ const FREE_TIME: &str = "free-time";
 const CDF_BASIS: &str = "cdf-basis";
 const HASH_BASIS: &str = "hash-basis";
 /// Minutes of one thread below which `cdf-basis` has no finest voxels, whose vertices are most of a step, and half the width, `hash-basis` has smaller tables,
-/// and images of moving scenes are small at first.
+/// and images of moving scenes are small at first (of several cameras and many frames for longer).
 const SHORT: f64 = 16.0;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
 const EXPOSURE: f32 = 0.09;
@@ -69,13 +72,6 @@ const DECAY: f64 = 0.005;
 const DECAY_CAMERAS: usize = 20;
 /// What a pixel adds to a footprint, square pixels: little more than the 1/12 of its own area. Held-out views gain 0.0 to 0.34 dB over 0.3.
 const BLUR: f64 = 0.1;
-/// Share of a short run with smaller images, whose iterations take a fraction of the time: 0.9 dB on mutant in ten minutes of one thread, 0.2 on basketball in
-/// five. In ten, basketball gains nothing more, and a long run of mutant with 100,000 Gaussians got worse while its images were small.
-const IMAGE_GROWTH: f64 = 0.5;
-/// Weight of strain where one camera at a time sees everything move, from unrelated poses: 0.3 dB on mutant.
-const STRAIN: f64 = 0.03;
-/// Up to so many Gaussians, means learn at their full rate. With 86,000 and more, training views of mutant got worse for a thousand iterations.
-const FULL_RATE_GAUSSIANS: f64 = 15_000.0;
 /// Share of transparent pixels from which a scene is an object without surroundings.
 const OBJECT: f32 = 0.05;
 
@@ -242,60 +238,6 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, stated: Option<&str>, ke
 /// Whether there is little time for a machine without a graphics card.
 fn is_short(machine: Machine, minutes: f64) -> bool {
     !machine.graphics && machine.speed() * minutes < SHORT
-}
-
-/// Factor of the learning rate of means for so many Gaussians: their size falls with the root of their number, and a step stays the same share of it.
-fn slower(gaussians: f64) -> f64 {
-    (FULL_RATE_GAUSSIANS / gaussians).sqrt().min(1.0)
-}
-
-fn stages(facts: &Facts, machine: Machine, minutes: f64, most: f64, key_frames: Option<usize>) -> Choice {
-    let shares = |shares: [f64; 3]| Value::Array(shares.map(Value::Float).to_vec());
-    let slower = if all_move(facts) { slower(most) } else { 1.0 };
-    let growth = if is_short(machine, minutes) { IMAGE_GROWTH } else { 0.0 };
-    let (mut settings, reason) = match facts.arrangement {
-        _ if stands_still(facts) => (vec![("train.shares", shares([1.0, 0.0, 4.0])), ("train.coarse_frames", "all".into())], "a static scene".to_string()),
-        Arrangement::OneMovingCamera if !stands_alone(facts) => (
-            vec![("train.shares", shares([5.0, 2.0, 18.0])), ("train.coarse_frames", "all".into()), ("train.dynamic", "score".into())],
-            "one moving camera: all frames come at once, and what a static reconstruction does not explain may move".into(),
-        ),
-        Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere => (
-            vec![
-                ("train.shares", shares([2.0, 0.0, 18.0])),
-                ("train.coarse_frames", "all".into()),
-                ("train.dynamic", "all".into()),
-                ("train.recover", Value::Boolean(true)),
-                // Short runs end before what moves has its shape and colour: 0.35 dB on mutant after 2,000 iterations against the published rates.
-                ("train.lr.means", rate(3.2e-4 * slower)),
-                ("train.lr.log_scales", Value::Float(1e-2)),
-                ("train.lr.sh_rest", Value::Float(5e-4)),
-                ("train.strain", Value::Float(if facts.arrangement == Arrangement::OneCameraAnywhere { STRAIN } else { 0.0 })),
-                ("train.image_growth", Value::Float(growth)),
-            ],
-            format!("{}: all frames come at once, everything may move, and what crosses the scene is looked for", facts.arrangement.describe()),
-        ),
-        Arrangement::Photos | Arrangement::Dome | Arrangement::Rig => {
-            // Lives need neither frames that come one after another nor a smooth function of space.
-            let (ramp, smooth) = match key_frames {
-                Some(_) => (0.0, 0.0),
-                None => (0.4, if facts.frames < 12 { 0.0 } else { 0.05 }),
-            };
-            (
-                vec![
-                    ("train.shares", shares([5.0, 3.0, 20.0])),
-                    ("train.coarse_frames", "first".into()),
-                    ("train.dynamic", "auto".into()),
-                    ("train.time_ramp", Value::Float(ramp)),
-                    ("train.lambda_r", Value::Float(smooth)),
-                    ("train.image_growth", Value::Float(growth)),
-                ],
-                format!("{} training cameras, {}: the first frame, then what moves", facts.cameras, facts.arrangement.describe()),
-            )
-        }
-    };
-    // Positions still settle at the end of a short run: 0.3 dB on two built-in captures against a rate that falls a hundredfold.
-    settings.push(("train.lr.means_end", rate(1.6e-5 * slower)));
-    choice(settings, reason)
 }
 
 /// Whether one camera at a time sees an object without surroundings, or nothing that stands still.

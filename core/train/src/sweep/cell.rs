@@ -17,7 +17,7 @@ use crate::train::{TuneJob, Tuner};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, StreamKind};
 use cc4dgs_core::{Error, Limits, Result, Scene, parse_device};
-use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_play::{ArchiveOptions, Model, ViewSource};
 use serde::Serialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -71,7 +71,7 @@ impl<'a> Trained<'a> {
             codec: &choice.codec,
             settings: &choice.settings,
             field_weights: &choice.field_weights,
-            scene: Some((&self.scene, &self.device)),
+            views: Some((ViewSource::Scene(&self.scene), &self.device)),
             tuner: Some(&tuner),
         };
         self.model.save_archive(&archive, &options, worker.registry, &self.limits, worker.events)?;
