@@ -189,6 +189,63 @@ fn a_loss_is_measured_on_the_views_that_judge() {
     assert!(said.iter().any(|note| note.contains("dB lower on 4 validation views (0.5 dB allowed)")), "{said:?}");
 }
 
+/// Views without images, as those of an orbit.
+struct Cameras(Views);
+
+impl TrainingViews for Cameras {
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+    fn kind(&self) -> &'static str {
+        "orbit"
+    }
+    fn has_images(&self) -> bool {
+        false
+    }
+    fn view(&self, index: usize) -> (&Camera, f32) {
+        self.0.view(index)
+    }
+    fn image(&self, _: usize) -> Result<Image8> {
+        panic!("nothing was recorded")
+    }
+}
+
+#[test]
+fn without_images_the_difference_between_renders_is_what_was_asked_for() {
+    cc4dgs_codecs::link();
+    let (g, notes) = (scene(400), Notes::default());
+    let views = Cameras(recorded(&g));
+    let context = CodecContext {
+        views: Some(&views),
+        renderer: Some(&Blots),
+        dynamic_threshold: Some(f32::NEG_INFINITY),
+        ..CodecContext::new(Seed::root(1), Limits::default(), &notes)
+    };
+    let encode = |profile: &str| -> Result<(usize, f64)> {
+        let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)(profile, &toml::Table::new()).unwrap();
+        let streams = codec.encode(&g, &context)?;
+        let found = codec.decode(&streams, &CodecContext::new(Seed::root(1), Limits::default(), &Silent))?;
+        let (mut error, mut samples) = (0.0, 0);
+        for (camera, time, _) in &views.0.0 {
+            let [before, after] = [&g, &found].map(|g| Blots.render(g, camera, *time).unwrap().planes);
+            error += before.iter().zip(&after).take(3 * SIZE * SIZE).map(|(a, b)| f64::from(a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).powi(2)).sum::<f64>();
+            samples += 3 * SIZE * SIZE;
+        }
+        Ok((streams.iter().map(|s| s.bytes.len()).sum::<usize>(), -10.0 * (error / f64::from(samples as u32)).log10()))
+    };
+    // Without a profile it is 50 dB.
+    let [fine, usual, coarse] = ["psnr=60dB", "", "psnr=40dB"].map(|profile| encode(profile).unwrap());
+    for ((bytes, reached), wanted) in [(fine, 60.0), (usual, 50.0), (coarse, 40.0)] {
+        // So few Gaussians have leaps between neighbouring steps.
+        assert!((wanted..wanted + 2.0).contains(&reached), "{bytes} bytes, {reached} dB in place of {wanted}");
+    }
+    assert!(coarse.0 < usual.0 && usual.0 < fine.0, "{coarse:?}, {usual:?}, {fine:?}");
+    assert!(notes.0.lock().unwrap().iter().any(|n| n.contains("before and after on 4 orbit views (40.00 dB wanted)")));
+    // A loss needs images.
+    let refused = encode("max-drop=0.05dB").unwrap_err().to_string();
+    assert!(refused.starts_with("codec compact.max_drop_db") && refused.contains("--scene"), "{refused}");
+}
+
 #[test]
 fn attributes_of_plug_ins_are_rounded_by_what_is_seen() {
     cc4dgs_codecs::link();
@@ -243,7 +300,7 @@ fn attributes_of_plug_ins_are_rounded_by_what_is_seen() {
 #[test]
 fn attributes_that_no_row_needs_are_stored_where_it_is_not_known_what_moves() {
     cc4dgs_codecs::link();
-    let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)("psnr=50dB", &toml::Table::new()).unwrap();
+    let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)("", &"max_drop_db = 0.0".parse().unwrap()).unwrap();
     let count = 60;
     let mut g = scene(count);
     let velocity = ExtraAttribute::exact(2, (0..2 * count).map(|i| 0.2 * draw(i, 90)).collect());

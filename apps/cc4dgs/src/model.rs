@@ -2,7 +2,7 @@
 
 use crate::Session;
 use cc4dgs_core::{Event, Result, Scene};
-use cc4dgs_play::ArchiveOptions;
+use cc4dgs_play::{ArchiveOptions, OrbitViews, ViewSource};
 use cc4dgs_train::train::{TuneJob, Tuner};
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
@@ -31,9 +31,9 @@ impl Model {
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) for unknown codecs and profiles, and what codec and disk report.
     pub fn save(&self, path: impl AsRef<Path>, codec: &str) -> Result<u64> {
-        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None, tuner: None })
+        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, views: None, tuner: None })
     }
-    /// As [`Model::save`], with settings of the codec, a weight codec for the deformer, and the scene for codecs that make use of it.
+    /// As [`Model::save`], with settings of the codec, a weight codec for the deformer, and the views for codecs that make use of them.
     ///
     /// # Errors
     /// As [`Model::save`], and for settings the codec does not have.
@@ -60,7 +60,18 @@ impl Model {
             events: session.events(),
             stop: session.stop_flag(),
         });
-        self.save_with(path, &ArchiveOptions { codec, settings, field_weights, scene: Some((scene, session.device())), tuner: Some(&tuner) })
+        let views = Some((ViewSource::Scene(scene), session.device()));
+        self.save_with(path, &ArchiveOptions { codec, settings, field_weights, views, tuner: Some(&tuner) })
+    }
+    /// As [`Model::save_with`], with `count` views all round the model for codecs that make use of them, where its scene is not there: `compact` looks at how
+    /// much each value matters there, and compares renders before and after. The cameras are outside, so this is not for rooms that are seen from within.
+    ///
+    /// # Errors
+    /// As [`Model::save_with`] and [`OrbitViews::around`], and [`Error::Parameter`](crate::Error::Parameter) for settings that need the images of a scene.
+    pub fn save_on_orbit(&self, path: impl AsRef<Path>, codec: &str, settings: &toml::Table, field_weights: &str, count: usize) -> Result<u64> {
+        let orbit = OrbitViews::around(&self.inner.gaussians, OrbitViews::SIZE, count)?;
+        let views = Some((ViewSource::Orbit(&orbit), self.session.device()));
+        self.save_with(path, &ArchiveOptions { codec, settings, field_weights, views, tuner: None })
     }
 }
 

@@ -103,7 +103,7 @@ impl Stored {
     /// As [`PlayModel::to_archive`].
     pub fn of_model(model: &PlayModel, storage: Storage, around: Surroundings) -> Result<Self> {
         let Storage { codec, field_weights } = storage;
-        let options = ArchiveOptions { codec, settings: &toml::Table::new(), field_weights, scene: None, tuner: None };
+        let options = ArchiveOptions { codec, settings: &toml::Table::new(), field_weights, views: None, tuner: None };
         let bytes = model.to_archive(&options, around.registry, around.limits, around.events)?;
         Self::of_archive("the stored model", Archive::from_bytes("the stored model", bytes, around.limits)?, around)
     }

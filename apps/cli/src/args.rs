@@ -14,6 +14,7 @@ pub use play::{VIEW_DEVICE, VIEW_MAX_ERROR};
 pub use prune::Prune;
 pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRun, SweepWhat};
 
+use cc4dgs_play::OrbitViews;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -147,13 +148,17 @@ pub struct Compress {
     /// The dataset that the model was trained on, for codecs that make use of its views; validation views, else training views, judge what is lost.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
+    /// For codecs that make use of views, N of them all round the model, 12 to 512: where its dataset is not there. They see it from outside, so not for rooms
+    /// that are seen from within.
+    #[arg(long, value_name = "N", conflicts_with = "scene", value_parser = parse_orbit)]
+    pub orbit: Option<usize>,
     /// The archive to write.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,
     /// Replace F.cc4d where it exists.
     #[arg(long)]
     pub overwrite: bool,
-    /// Device the deformer is loaded on; with --scene, the model is also drawn and trained further on it.
+    /// Device the deformer is loaded on; with --scene or --orbit, the model is also drawn on it, and with --scene trained further.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }
@@ -314,6 +319,12 @@ impl From<UpArg> for [f64; 3] {
             UpArg::MinusZ => [0.0, 0.0, -1.0],
         }
     }
+}
+
+/// A number of views that an orbit may have.
+fn parse_orbit(text: &str) -> Result<usize, String> {
+    let (least, most) = (*OrbitViews::COUNTS.start(), *OrbitViews::COUNTS.end());
+    text.parse::<usize>().ok().filter(|count| OrbitViews::COUNTS.contains(count)).ok_or_else(|| format!("choose {least} to {most} views"))
 }
 
 /// Reads `800x600`.

@@ -71,6 +71,13 @@ fn mistakes_end_with_their_own_exit_code() {
         ("compress x --field-weights compact:max-drop=0.01dB --out y.cc4d", "'compact:max-drop=0.01dB': a loss of PSNR"),
         ("compress x --codec compact:max-drop=0.05dB --out y.cc4d", "(--scene), or choose --codec compact:psnr"),
         ("compress x --codec compact --set finetune=9 --out y.cc4d", "(--scene), or leave --set finetune out"),
+        // An orbit has no images, and no scene options.
+        ("compress x --orbit 16 --field-weights compact:max-drop=0.01dB --out y.cc4d", "'compact:max-drop=0.01dB': a loss of PSNR"),
+        ("compress x --orbit 16 --codec compact:max-drop=0.05dB --out y.cc4d", "(--scene), or choose --codec compact:psnr"),
+        ("compress x --orbit 16 --codec compact --set finetune=9 --out y.cc4d", "(--scene), or leave --set finetune out"),
+        ("compress x --orbit 16 --set scene.width=9 --out y.cc4d", "scene options without --scene"),
+        ("compress x --orbit 16 --scene y --out y.cc4d", "cannot be used with"),
+        ("compress x --orbit 11 --out y.cc4d", "12 to 512 views"),
         ("bake x --field-weights compact:max-drop=0.01dB --out y.cc4d", "(--scene), or state the bits"),
     ] {
         let said = fail(&args.split(' ').collect::<Vec<_>>(), 2);
@@ -231,6 +238,28 @@ fn every_kind_of_model_is_taken_everywhere() {
     for bad in [at("notes.txt"), at("frames")] {
         assert!(fail(&["compress", text(&bad), "--out", text(&at("no.cc4d")), "-q"], 3).contains("SPZ"));
     }
+}
+
+/// A downloaded file has no scene: the codec that measures looks at it from all round.
+#[test]
+fn a_model_without_a_scene_is_measured_in_an_orbit() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (ply, archive, count) = (at("a.ply"), at("a.cc4d"), 40);
+    let gaussians = cc4dgs_core::HostGaussians {
+        means: (0..3 * count).map(|i| (1.7 * i as f32).sin()).collect(),
+        log_scales: vec![-1.5; 3 * count],
+        quaternions: [1.0, 0.0, 0.0, 0.0].repeat(count),
+        opacity_logits: vec![1.0; count],
+        sh_dc: (0..3 * count).map(|i| (2.3 * i as f32).cos()).collect(),
+        dynamic_scores: vec![0.0; count],
+        ..Default::default()
+    };
+    cc4dgs_core::ply::write(&ply, &gaussians, false).unwrap();
+    let output = succeed(&["compress", text(&ply), "--orbit", "16", "--codec", "compact:psnr=45dB", "--out", text(&archive), "--json"]);
+    let (report, said): (Value, String) = (serde_json::from_slice(&output.stdout).unwrap(), common::said(&output));
+    assert!(report["gaussians"] == count && report["bytes"] == std::fs::metadata(&archive).unwrap().len(), "{report}");
+    assert!(said.contains("16 orbit views"), "{said}");
 }
 
 #[test]

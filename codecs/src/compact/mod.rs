@@ -26,6 +26,7 @@ mod read;
 mod restore;
 mod rounding;
 mod search;
+mod seek;
 mod sensitivity;
 mod settings;
 mod transform;

@@ -9,14 +9,14 @@ max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on validat
 max_size_mb = 0.0        # the best Gaussians in a file of at most so many MB, all included; `compact:max-size=5MB` for short. 0: no limit
 finetune = 500           # with --scene: iterations in which Gaussians and deformer are trained further with rounded values, in larger steps; 0: none
 size_weight = 4.0        # how much bits count in fine-tuning; 0 trains for accuracy alone
-psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short
+psnr_db = 50.0           # PSNR between images before and after, measured with --scene or --orbit, else estimated; `compact:psnr=50dB` for short. It counts where no size is bounded, and no loss, or where no images measure a loss
 rate_weight = 0.0        # how much bits count when colour coefficients above degree 0 are rounded; 0 rounds to the nearest, which is best for images
-measured = true          # with --scene: weights from derivatives of renders; false: from sizes and opacities
+measured = true          # with --scene or --orbit: weights from derivatives of renders; false: from sizes and opacities
 adaptive = true          # steps of their own for Gaussians that are seen more or less
-shapes = true            # with --scene: steps of shapes by the weights of shapes; false: by those of colours
-allocate = true          # with --scene: correct the steps of the columns by what a change of each costs and saves
+shapes = true            # with --scene or --orbit: steps of shapes by the weights of shapes; false: by those of colours
+allocate = true          # with --scene or --orbit: correct the steps of the columns by what a change of each costs and saves
 transform = true         # transform the colour coefficients of each degree
-joint = true             # with --scene and without fine-tuning: round the colour coefficients of a Gaussian together, for the directions that views see
+joint = true             # with --scene or --orbit, without fine-tuning: round the colour coefficients of a Gaussian together, for the directions that views see
 canonical = true         # sort the axes of Gaussians whose shape does not change
 layers = 0               # sets of Gaussians by falling weight, which a player draws one by one while they arrive, up to 6; 0: 3 from 131,072 Gaussians on, else 1
 ";
@@ -33,7 +33,7 @@ pub struct Settings {
     pub finetune: usize,
     /// How much bits count in fine-tuning.
     pub size_weight: f64,
-    /// Estimated PSNR between images before and after, in dB.
+    /// PSNR between images before and after, in dB: measured where there are views, else estimated.
     pub psnr_db: f64,
     /// How much bits count when colour coefficients are rounded.
     pub rate_weight: f64,
@@ -56,6 +56,9 @@ pub struct Settings {
     /// Whether the user asked for a loss of PSNR, which needs a scene.
     #[serde(skip)]
     pub drop_wanted: bool,
+    /// Whether the user asked for a PSNR between images.
+    #[serde(skip)]
+    pub psnr_wanted: bool,
     /// Whether the user asked for iterations of fine-tuning, which need a scene.
     #[serde(skip)]
     pub finetune_wanted: bool,
@@ -79,6 +82,7 @@ impl Default for Settings {
             canonical: true,
             layers: 0,
             drop_wanted: false,
+            psnr_wanted: false,
             finetune_wanted: false,
         }
     }
@@ -93,6 +97,7 @@ impl Settings {
     pub fn parse(profile: &str, table: &toml::Table) -> Result<Self> {
         let mut section = toml::Table::new();
         let drop_wanted = profile.starts_with("max-drop") || table.contains_key("max_drop_db");
+        let psnr_wanted = profile.starts_with("psnr") || table.contains_key("psnr_db");
         if !matches!(profile, "" | "default") {
             let (name, value) = profile.split_once('=').unwrap_or((profile, ""));
             let Some((_, setting, unit, off)) = PROFILES.iter().find(|p| p.0 == name) else {
@@ -109,7 +114,7 @@ impl Settings {
         config::merge(&mut section, table);
         let parsed: Self = config::parse_section("codec compact", &section)?;
         let (drop_wanted, finetune_wanted) = (drop_wanted && parsed.max_drop_db > 0.0, table.contains_key("finetune") && parsed.finetune > 0);
-        let settings = Self { drop_wanted, finetune_wanted, ..parsed };
+        let settings = Self { drop_wanted, psnr_wanted, finetune_wanted, ..parsed };
         let bounds = [
             ("max_drop_db", settings.max_drop_db, 0.0..=20.0),
             ("max_size_mb", settings.max_size_mb, 0.0..=1e6),
@@ -171,7 +176,7 @@ mod tests {
         assert!(parse("max-dorp=1dB").unwrap_err().to_string().contains("max-drop"));
         let schema: toml::Table = SCHEMA.parse().unwrap();
         let (read, default) = (Settings::parse("", &schema).unwrap(), parse("").unwrap());
-        assert_eq!(format!("{:?}", Settings { drop_wanted: false, finetune_wanted: false, ..read }), format!("{default:?}"));
+        assert_eq!(format!("{:?}", Settings { drop_wanted: false, psnr_wanted: false, finetune_wanted: false, ..read }), format!("{default:?}"));
     }
 
     #[test]

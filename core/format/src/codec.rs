@@ -62,8 +62,8 @@ pub trait AttributeCodec: Send + Sync {
     fn keeps_motion(&self) -> bool {
         false
     }
-    /// Refuses settings that need a scene ([`CodecContext::views`], [`CodecContext::tuner`]). It is asked where there is none, before any work;
-    /// [`AttributeCodec::encode`] refuses them as well.
+    /// Refuses settings that need a scene (recorded images, [`CodecContext::tuner`]). It is asked where there is none, or views without images in its place,
+    /// before any work; [`AttributeCodec::encode`] refuses them as well.
     ///
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) that names the setting and the remedy.

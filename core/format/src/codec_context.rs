@@ -2,8 +2,8 @@
 
 use crate::{Camera, EventSink, HostGaussians, Image8, Limits, Result, Seed, Stream, TuneModel, WeightArray};
 
-/// The context of a codec. The optional parts are set if a model is encoded together with its scene. A codec may use them for a better result, but must work
-/// without them. They are never set for decoding.
+/// The context of a codec. The optional parts are set if a model is encoded together with its scene, some of them also if it is encoded with views round it. A
+/// codec may use them for a better result, but must work without them. They are never set for decoding.
 pub struct CodecContext<'a> {
     /// The codec's node of the seed tree.
     pub seed: Seed,
@@ -11,7 +11,7 @@ pub struct CodecContext<'a> {
     pub limits: Limits,
     /// Receives progress and warnings.
     pub events: &'a dyn EventSink,
-    /// The views that the model was trained on.
+    /// The views that the model is measured in: those that it was trained on, or where its scene is not there, views round it, which have no images.
     pub views: Option<&'a dyn TrainingViews>,
     /// The views that judge what is lost, where they are stated: see [`CodecContext::judging_views`].
     pub judges: Option<&'a dyn TrainingViews>,
@@ -50,15 +50,15 @@ impl<'a> CodecContext<'a> {
             file_bytes: None,
         }
     }
-    /// The views on which a loss of PSNR is measured: validation views where the scene has some, else those that the model was trained on. `None` where there are
-    /// no views.
+    /// The views on which a loss of PSNR is measured: validation views where the scene has some, else those that the model is measured in. `None` where there
+    /// are no views. A loss is measured against recorded images, which not all views have ([`TrainingViews::has_images`]).
     pub fn judging_views(&self) -> Option<&'a dyn TrainingViews> {
         self.judges.into_iter().chain(self.views).find(|views| !views.is_empty())
     }
 }
 
-/// The training views of a scene, or its validation views where those judge, in an order in which every so many are of all cameras. Images are decoded on
-/// demand. Test views are not included.
+/// The views that a model is measured in: the training views of its scene, the validation views where those judge, or views round a model whose scene is not
+/// there. In their order, every so many are of all cameras, or from all sides. Images are decoded on demand. Test views are not included.
 pub trait TrainingViews {
     /// The number of views.
     fn len(&self) -> usize;
@@ -66,13 +66,17 @@ pub trait TrainingViews {
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// What they are called in messages: `training` or `validation`.
+    /// What they are called in messages: `training`, `validation` or `orbit`.
     fn kind(&self) -> &'static str {
         "training"
     }
+    /// Whether images were recorded there. The views of an orbit have none: [`TrainingViews::image`] is an error there.
+    fn has_images(&self) -> bool {
+        true
+    }
     /// Camera and time (0..1) of the view `index`, which must be below [`TrainingViews::len`].
     fn view(&self, index: usize) -> (&Camera, f32);
-    /// The recorded image of the view `index`, at the size of its camera.
+    /// The recorded image of the view `index`, at the size of its camera; an error where none was recorded.
     fn image(&self, index: usize) -> Result<Image8>;
 }
 

@@ -5,7 +5,7 @@ use crate::encoded_once::EncodedOnce;
 use crate::field_weights::{FieldWeights, StoredField};
 use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
-use crate::{Moving, RenderConfig};
+use crate::{Moving, OrbitViews, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind};
 use cc4dgs_core::format::check_linked;
@@ -25,6 +25,15 @@ use std::path::Path;
 /// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
 const ATTRIBUTES: &str = "attributes";
 
+/// Where codecs measure a model.
+#[derive(Clone, Copy)]
+pub enum ViewSource<'a> {
+    /// In the training views of the scene that the model was trained on. Its validation views judge what is lost, where it has some.
+    Scene(&'a Scene),
+    /// In views round the model, which have no images: for models whose scene is not there.
+    Orbit(&'a OrbitViews),
+}
+
 /// How [`Model::save_archive`] stores a model.
 pub struct ArchiveOptions<'a> {
     /// Codec of the Gaussians: `name` or `name:profile`.
@@ -33,15 +42,16 @@ pub struct ArchiveOptions<'a> {
     pub settings: &'a toml::Table,
     /// Weight codec of the field: see [`FieldWeights::parse`].
     pub field_weights: &'a str,
-    /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
-    /// field. Every codec works without.
-    pub scene: Option<(&'a Scene, &'a Device)>,
-    /// Trains the model further with rounded values, for codecs that make use of it. The archive's deformer then has the trained weights.
+    /// Where codecs measure the model, and the device that its field is on: for codecs that make use of views, of renders and of the field. Every codec works
+    /// without.
+    pub views: Option<(ViewSource<'a>, &'a Device)>,
+    /// Trains the model further with rounded values, for codecs that make use of it. The archive's deformer then has the trained weights. It is not used beside
+    /// an orbit, which has no images to train on.
     pub tuner: Option<&'a dyn TuneModel>,
 }
 
 impl ArchiveOptions<'_> {
-    /// Refuses codecs and settings that do not exist, and where there is no scene, those that need one. Call it before anything is read;
+    /// Refuses codecs and settings that do not exist, and where there is no scene, those that need one; an orbit is none. Call it before anything is read;
     /// [`Model::to_archive`] refuses the same, but for `field_weights` where the model has no deformer.
     ///
     /// # Errors
@@ -131,18 +141,24 @@ impl Model {
         self.archive_writer(options, registry, limits, events)?.to_bytes()
     }
     fn archive_writer(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<ArchiveWriter> {
-        let ArchiveOptions { codec: spec, settings, field_weights, scene, tuner } = *options;
+        let ArchiveOptions { codec: spec, settings, field_weights, views: source, tuner } = *options;
         self.check_size(limits)?;
         self.check_storable()?;
-        let tuner = tuner.map(EncodedOnce::new);
+        let device = source.map(|(_, device)| device);
+        let (scene, orbit) = match source.map(|(views, _)| views) {
+            Some(ViewSource::Scene(scene)) => (Some(scene), None),
+            Some(ViewSource::Orbit(orbit)) => (None, Some(orbit)),
+            None => (None, None),
+        };
+        let tuner = tuner.filter(|_| orbit.is_none()).map(EncodedOnce::new);
         let tuner = tuner.as_ref().map(|tuner| tuner as &dyn TuneModel);
         let codec = registry.build_codec(spec, settings)?;
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
-        let views = scene.map(|(scene, _)| SceneViews::new(scene));
-        let judges = scene.map(|(scene, _)| SceneViews::judging(scene));
-        let services = scene.map(|(_, device)| ModelServices::new(self, registry, device)).transpose()?;
+        let (training, judges) = (scene.map(SceneViews::new), scene.map(SceneViews::judging));
+        let views = training.as_ref().map(|v| v as &dyn TrainingViews).or(orbit.map(|v| v as &dyn TrainingViews));
+        let services = device.map(|device| ModelServices::new(self, registry, device)).transpose()?;
         let context = |seed: Seed| CodecContext {
-            views: views.as_ref().map(|v| v as &dyn TrainingViews),
+            views,
             judges: judges.as_ref().map(|v| v as &dyn TrainingViews),
             renderer: services.as_ref().map(|s| s as &dyn cc4dgs_core::RenderModel),
             deformer: services.as_ref().filter(|_| self.field.is_some()).map(|s| s as &dyn cc4dgs_core::EvaluateDeformer),
@@ -196,16 +212,16 @@ impl Model {
             let first = writer(found).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams.collect::<Vec<_>>());
             first.add_all(StreamKind::Canonical, harmonics)
         };
-        let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
+        let seed = weight_seed(self.provenance.seed);
         let untuned = OnceCell::new();
         let encode_weights = || -> Result<Option<EncodedWeights>> {
             let Some((stored, f)) = weights.as_ref().zip(field) else { return Ok(None) };
             let of_field = weights_of(f.field.as_ref())?;
             // What a tuner has measured and searched is not measured again.
-            if let Some(tuner) = tuner.filter(|_| views.as_ref().is_some_and(|v| !v.is_empty())) {
+            if let Some(tuner) = tuner.filter(|_| views.is_some_and(|v| !v.is_empty())) {
                 return tuner.encoded_weights(&of_field, 1.0).map(Some);
             }
-            let measured = device.zip(views.as_ref());
+            let measured = device.zip(views);
             let importance = measured.map(|(device, views)| stored.chosen.importance(self, views, registry, device, events)).transpose()?.flatten();
             let context = CodecContext { weight_importance: importance.as_deref(), ..context(seed) };
             stored.chosen.encode(self, &of_field, device, &context, registry).map(Some)

@@ -57,7 +57,7 @@ impl FieldWeights {
         out.max_drop_db = Some(number.ok_or_else(|| Error::parameter(object, format!("'{limit}' is no number of dB"), "Write compact:max-drop=0.01dB"))?);
         Ok(out)
     }
-    /// Refuses a search, which needs a scene. Call it where there is none, before any work.
+    /// Refuses a search, which needs the images of a scene. Call it where there is none, or an orbit in its place, before any work.
     ///
     /// # Errors
     /// [`Error::Parameter`] that names the weight codec and the remedy.
@@ -69,7 +69,7 @@ impl FieldWeights {
         let remedy = "Give the dataset to `cc4dgs compress` (--scene), or state the bits: --field-weights compact:bits=6";
         Error::parameter(object, "a loss of PSNR is measured on images of a scene, and there is none", remedy)
     }
-    /// How much images depend on each weight of `model`, where the codec makes use of it; measured on training views.
+    /// How much images depend on each weight of `model`, where the codec makes use of it; measured in `views`, of which the images are not needed.
     ///
     /// # Errors
     /// What the deformer and the device report.
@@ -91,14 +91,15 @@ impl FieldWeights {
         &self,
         model: &Model,
         weights: &[WeightArray],
-        scene: Option<&Device>,
+        device: Option<&Device>,
         context: &CodecContext,
         registry: &Registry,
     ) -> Result<EncodedWeights> {
         let Some(limit) = self.max_drop_db else {
             return Ok((registry.build_weight_codec(&self.name, &self.settings)?.encode(weights, context)?, self.settings.clone()));
         };
-        let Some((device, judges)) = scene.zip(context.judging_views()) else { return Err(self.needs_scene(limit)) };
+        let judges = context.judging_views().filter(|judges| judges.has_images());
+        let Some((device, judges)) = device.zip(judges) else { return Err(self.needs_scene(limit)) };
         let Some(of) = &model.field else { return Err(Error::backend("weight codec", "the model has no deformer", "Report this")) };
         let Some(range) = searched_bits(&registry.weight_codec(&self.name)?.info) else {
             return Err(Error::backend("weight codec", format!("{} has no bits to search", self.name), "Report this"));

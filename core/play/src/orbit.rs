@@ -4,7 +4,8 @@ use cc4dgs_core::{Camera, Error, HostGaussians, Result};
 
 /// Height of the circle over the model's middle, in radians.
 const ELEVATION: f64 = 0.35;
-const FOV_X: f64 = 0.9;
+/// Full horizontal angle of the cameras, in radians.
+pub(crate) const FOV_X: f64 = 0.9;
 /// Gaussians fainter than this are haze and say nothing of where the model is.
 const FAINT_LOGIT: f32 = -2.0;
 
@@ -34,7 +35,6 @@ impl Orbit {
     /// [`Error::Parameter`] for turns or an axis that are no numbers and for empty images, [`Error::Data`] for Gaussians so far away that no camera can look
     /// at them.
     pub fn around(&self, gaussians: &HostGaussians) -> Result<Vec<Camera>> {
-        let (width, height) = self.size;
         let bad = |problem: String, remedy: &str| Err(Error::parameter("orbit", problem, remedy));
         if !self.turns.is_finite() {
             return bad(format!("{} turns are not a number", self.turns), "Give the number of full turns, such as 1");
@@ -42,34 +42,49 @@ impl Orbit {
         let Some(axis) = self.up.iter().position(|c| c.abs() == 1.0).filter(|_| self.up.iter().map(|c| c.abs()).sum::<f64>() == 1.0) else {
             return bad(format!("{:?} is no signed axis", self.up), "Give one of x, y and z with its sign, such as [0, 0, 1]");
         };
-        if width == 0 || height == 0 {
-            return bad(format!("images of {width}x{height} pixels are empty"), "Give a size such as 800x600");
-        }
-        let (middle, radius) = middle_and_radius(gaussians);
+        let (middle, distance) = middle_and_distance(gaussians, self.size)?;
         // Two axes perpendicular to `up`.
         let (mut side, mut front) = ([0.0; 3], [0.0; 3]);
         side[(axis + 1) % 3] = 1.0;
         front[(axis + 2) % 3] = 1.0;
-        // Far enough for a sphere of the radius to fill most of the narrower field of view.
-        let narrow = 0.5 * FOV_X * f64::from(height.min(width)) / f64::from(width);
-        let distance = 1.1 * radius / narrow.sin();
         let camera = |i: usize| {
             let (s, c) = (self.turns * std::f64::consts::TAU * i as f64 / self.frames.max(1) as f64).sin_cos();
             let flat = distance * ELEVATION.cos();
             let eye: [f64; 3] = std::array::from_fn(|k| middle[k] + flat * (c * side[k] + s * front[k]) + distance * ELEVATION.sin() * self.up[k]);
             Camera::look_at(&format!("orbit{i:05}"), self.size, FOV_X, eye, middle, self.up)
         };
-        let cameras: Vec<Camera> = (0..self.frames).map(camera).collect();
-        cameras.iter().try_for_each(Camera::validate).map_err(|_| {
-            let problem = format!("no camera can look at Gaussians around {middle:?} from {distance:e} away; such numbers are too far apart for float64");
-            Error::data("orbit", problem, "Move the model to the origin, or remove Gaussians that are far away")
-        })?;
-        Ok(cameras)
+        checked((0..self.frames).map(camera).collect(), middle, distance)
     }
     /// Normalised time of a frame, so that time runs from 0 to 1 over the orbit.
     pub fn time(&self, frame: usize) -> f32 {
         if self.frames > 1 { frame as f32 / (self.frames - 1) as f32 } else { 0.0 }
     }
+}
+
+/// The middle of `gaussians`, and how far from it a camera sees most of what they show in images of `size` (width and height in pixels).
+///
+/// # Errors
+/// [`Error::Parameter`] for empty images.
+pub(crate) fn middle_and_distance(gaussians: &HostGaussians, (width, height): (u32, u32)) -> Result<([f64; 3], f64)> {
+    if width == 0 || height == 0 {
+        return Err(Error::parameter("orbit", format!("images of {width}x{height} pixels are empty"), "Give a size such as 800x600"));
+    }
+    let (middle, radius) = middle_and_radius(gaussians);
+    // Far enough for a sphere of the radius to fill most of the narrower field of view.
+    let narrow = 0.5 * FOV_X * f64::from(height.min(width)) / f64::from(width);
+    Ok((middle, 1.1 * radius / narrow.sin()))
+}
+
+/// `cameras` that look at `middle` from `distance` away.
+///
+/// # Errors
+/// [`Error::Data`] where that is so far away that no camera can look at it.
+pub(crate) fn checked(cameras: Vec<Camera>, middle: [f64; 3], distance: f64) -> Result<Vec<Camera>> {
+    cameras.iter().try_for_each(Camera::validate).map_err(|_| {
+        let problem = format!("no camera can look at Gaussians around {middle:?} from {distance:e} away; such numbers are too far apart for float64");
+        Error::data("orbit", problem, "Move the model to the origin, or remove Gaussians that are far away")
+    })?;
+    Ok(cameras)
 }
 
 /// The median of the centres and the distance within which 70 % of them lie: a background far away must not push the camera out.

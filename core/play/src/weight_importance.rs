@@ -12,7 +12,7 @@ use std::ops::RangeInclusive;
 const IMAGES: RangeInclusive<usize> = 24..=128;
 const WORK: usize = 1_500_000;
 
-/// The mean over training views, for each weight of each array of the deformer, of the sum over pixels and channels of the squared derivative of the image by it.
+/// The mean over `views`, for each weight of each array of the deformer, of the sum over pixels and channels of the squared derivative of the image by it.
 ///
 /// Each image estimates it by the square of the derivative of a sum with random signs (Hutchinson 1989). Other images may depend on weights on which
 /// none of these does, so every weight has at least the share 1 / images² of the mean of its array.

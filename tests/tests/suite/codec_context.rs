@@ -15,7 +15,7 @@ use cc4dgs_play::codec_services::{ModelServices, SceneViews};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::{ModelDeformer, ModelSize};
 use cc4dgs_play::player::Player;
-use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_play::{ArchiveOptions, Model, OrbitViews, ViewSource};
 use cc4dgs_tests::larger;
 use cc4dgs_train::data;
 use std::cell::RefCell;
@@ -100,6 +100,18 @@ fn model(registry: &Registry) -> Model {
     }
 }
 
+/// The same Gaussians with a deformer whose weights move everything.
+pub(super) fn moved_by_weights(registry: &Registry, device: &Device) -> Model {
+    let mut model = model(registry);
+    let section: toml::Table = "kind = \"cdf-basis\"\ncapacity = \"small\"\nresolutions = [8]\nhashes = 16\ntime_bands = 2".parse().unwrap();
+    let context = model.field.as_ref().unwrap().context.clone();
+    let mut field = registry.build_deformer(&section, &context, device).unwrap();
+    add_noise(field.as_mut(), 0.07, 1, device);
+    (model.field, model.moving) = (Some(ModelDeformer { field, section, context }), Moving::Everything);
+    model.gaussians.extra.clear();
+    model
+}
+
 fn scene() -> cc4dgs_core::Scene {
     data::open(Path::new("procedural"), &SceneOptions { width: 40, height: 40, ..Default::default() }, &Registry::collect().unwrap(), &Limits::default())
         .unwrap()
@@ -113,7 +125,8 @@ fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
     let settings = toml::Table::new();
     let notes = |scene: Option<&cc4dgs_core::Scene>| -> Vec<String> {
         let events = Recorder::default();
-        let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", scene: scene.map(|s| (s, &device)), tuner: None };
+        let views = scene.map(|s| (ViewSource::Scene(s), &device));
+        let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", views, tuner: None };
         model.save_archive(&folder.path().join("m.cc4d"), &options, &registry, &Limits::default(), &events).unwrap();
         events.events().into_iter().filter_map(|e| if let Event::Note { message, .. } = e { Some(message) } else { None }).collect()
     };
@@ -163,20 +176,26 @@ fn weights_are_encoded_once_for_each_of_their_steps() {
     let registry = Registry::collect().unwrap();
     let (model, scene, device, tuner) = (model(&registry), scene(), Device::flex(), Counting::default());
     let (settings, limits) = (toml::Table::new(), Limits::default());
-    let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", scene: Some((&scene, &device)), tuner: Some(&tuner) };
+    let views = Some((ViewSource::Scene(&scene), &device));
+    let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", views, tuner: Some(&tuner) };
     let bytes = model.to_archive(&options, &registry, &limits, &Silent).unwrap();
     // Those of the codec twice, and once those of the model itself.
     assert_eq!(*tuner.encoded.borrow(), [2.0, 4.0, 1.0]);
     assert!(tuner.adopted.borrow().is_some(), "the tuner is told what was adopted");
     let stored = Archive::from_bytes("t", bytes, &limits).unwrap().manifest().deformer.clone().unwrap().weights;
     assert_eq!(stored.settings["steps"].as_float(), Some(2.0), "what was adopted is stored");
+
+    // An orbit has no images to train on.
+    let orbit = OrbitViews::around(&model.gaussians, (40, 30), 12).unwrap();
+    model.to_archive(&ArchiveOptions { codec: "raw", views: Some((ViewSource::Orbit(&orbit), &device)), ..options }, &registry, &limits, &Silent).unwrap();
+    assert_eq!(tuner.encoded.borrow().len(), 3);
 }
 
 #[test]
 fn gaussians_that_no_reader_accepts_are_not_encoded() {
     let registry = Registry::collect().unwrap();
     let (model, settings) = (model(&registry), toml::Table::new());
-    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "fp32", scene: None, tuner: None };
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "fp32", views: None, tuner: None };
     let write = |max_bytes: u64| model.to_archive(&options, &registry, &Limits { max_bytes, ..Limits::default() }, &Silent);
     let bytes = model.float32_size().point_cloud;
     assert!(write(bytes).is_ok());
@@ -188,18 +207,13 @@ fn gaussians_that_no_reader_accepts_are_not_encoded() {
 #[test]
 fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     let registry = Registry::collect().unwrap();
-    let (mut model, scene, device) = (model(&registry), scene(), Device::flex());
-    // A deformer whose weights move everything.
-    let section: toml::Table = "kind = \"cdf-basis\"\ncapacity = \"small\"\nresolutions = [8]\nhashes = 16\ntime_bands = 2".parse().unwrap();
-    let context = model.field.as_ref().unwrap().context.clone();
-    let mut field = registry.build_deformer(&section, &context, &device).unwrap();
-    add_noise(field.as_mut(), 0.07, 1, &device);
-    (model.field, model.moving) = (Some(ModelDeformer { field, section, context }), Moving::Everything);
-    model.gaussians.extra.clear();
+    let (scene, device) = (scene(), Device::flex());
+    let model = moved_by_weights(&registry, &device);
     let folder = tempfile::tempdir().unwrap();
     let (settings, path) = (toml::Table::new(), folder.path().join("m.cc4d"));
+    let views = Some((ViewSource::Scene(&scene), &device));
     let bits = |field_weights: &str| {
-        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights, scene: Some((&scene, &device)), tuner: None };
+        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights, views, tuner: None };
         model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap();
         let entry = Archive::open(&path, &Limits::default()).unwrap().manifest().deformer.clone().unwrap().weights;
         Model::open(&path, &registry, &device, &Limits::default(), &Silent).unwrap();
@@ -213,23 +227,24 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     assert!(fewest.len() > 1 && fewest.iter().all(|b| *b == 3.0), "{fewest:?}");
     assert!(bits("compact:max-drop=0.001dB").iter().sum::<f64>() > 4.0 * fewest.len() as f64);
     for bad in ["compact:max-drop=x", "fp16:max-drop=0.1dB", "compact:bits=17", "compact:bits", "nothing"] {
-        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: bad, scene: Some((&scene, &device)), tuner: None };
+        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: bad, views, tuner: None };
         assert!(model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).is_err(), "{bad}");
     }
-    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", scene: None, tuner: None };
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", views: None, tuner: None };
     let refused = model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap_err();
     assert!(refused.to_string().contains("--scene") && refused.to_string().contains("--field-weights"), "{refused}");
 
     // Validation views judge where there are some.
     let (held_out, events) = (data::hold_out(&scene, 12).unwrap(), Recorder::default());
-    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=60dB", scene: Some((&held_out, &device)), tuner: None };
+    let views = Some((ViewSource::Scene(&held_out), &device));
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=60dB", views, tuner: None };
     model.save_archive(&path, &options, &registry, &Limits::default(), &events).unwrap();
     let judged = |event: &Event| matches!(event, Event::Note { message, .. } if message.contains("validation views (60 dB allowed)"));
     assert!(events.events().iter().any(judged), "{:?}", events.events());
 
     // A bound on the size is one of the whole file.
     let size = |codec: &str, field_weights: &str| {
-        let options = ArchiveOptions { codec, settings: &settings, field_weights, scene: None, tuner: None };
+        let options = ArchiveOptions { codec, settings: &settings, field_weights, views: None, tuner: None };
         model.save_archive(&path, &options, &registry, &Limits::default(), &Silent)
     };
     let most = size("compact:psnr=60dB", "fp16").unwrap() + 2000;
@@ -315,7 +330,8 @@ fn an_archive_has_the_same_bits_on_every_device() {
     let folder = tempfile::tempdir().unwrap();
     let (path, limits) = (folder.path().join("m.cc4d"), Limits::default());
     let settings = "finetune = 0\nmax_drop_db = 1.0".parse().unwrap();
-    let options = ArchiveOptions { codec: "compact", settings: &settings, field_weights: "compact", scene: Some((&scene, &device)), tuner: None };
+    let views = Some((ViewSource::Scene(&scene), &device));
+    let options = ArchiveOptions { codec: "compact", settings: &settings, field_weights: "compact", views, tuner: None };
     model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
     let stored = Archive::open(&path, &limits).unwrap().stream_sizes();
     assert!(stored.iter().any(|s| s.name.starts_with("coded.")), "attributes are rounded where the scene is given");
@@ -407,7 +423,7 @@ fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
     let mut sizes = Vec::new();
     for codec in ["raw", "quantize"] {
         let path = folder.path().join(format!("{codec}.cc4d"));
-        let options = ArchiveOptions { codec, settings: &settings, field_weights: "fp32", scene: None, tuner: None };
+        let options = ArchiveOptions { codec, settings: &settings, field_weights: "fp32", views: None, tuner: None };
         model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
         let stored: u64 = Archive::open(&path, &limits).unwrap().stream_sizes().iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
         sizes.push(stored);

@@ -31,7 +31,7 @@ fn tiny_of(preset: &str, extra: &[&str]) -> RunConfig {
 /// Storage with `codec` and the weight codec `field_weights`, without a scene.
 fn options<'a>(codec: &'a str, field_weights: &'a str) -> ArchiveOptions<'a> {
     static NO_SETTINGS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
-    ArchiveOptions { codec, settings: &NO_SETTINGS, field_weights, scene: None, tuner: None }
+    ArchiveOptions { codec, settings: &NO_SETTINGS, field_weights, views: None, tuner: None }
 }
 
 fn open(config: &RunConfig) -> Arc<Scene> {

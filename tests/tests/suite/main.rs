@@ -28,6 +28,7 @@ mod lives;
 mod lookup;
 mod manifests;
 mod observer;
+mod orbit;
 mod planted;
 mod raster;
 mod raster_edges;

@@ -44,6 +44,11 @@ fn a_session_trains_saves_opens_and_plays() {
     let settings = "finetune = 20".parse().unwrap();
     let bytes = model.save_tuned(&tuned, "compact", &settings, "compact", &scene).unwrap();
     assert!(2 * bytes < std::fs::metadata(&file).unwrap().len() && session.open(&tuned).unwrap().gaussians.len() == model.gaussians.len());
+    // Without a scene, they may have views round the model.
+    let around = folder.path().join("around.cc4d");
+    let on_orbit = |count: usize| model.save_on_orbit(&around, "raw", &toml::Table::new(), "fp32", count);
+    assert_eq!(on_orbit(12).unwrap(), std::fs::metadata(&file).unwrap().len());
+    assert!(on_orbit(5).unwrap_err().to_string().contains("12 to 512"));
     let orbit = Orbit { size: (40, 30), frames: 3, ..Orbit::default() };
     let cameras = orbit.around(&model.gaussians).unwrap();
     let (mut first, mut second) = (session.player(&model).unwrap(), session.player(&opened).unwrap());

@@ -5,7 +5,7 @@ use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{Error, FrameSource, Image8, Limits, Registry, Result, Scene, Silent, TuneModel};
 use cc4dgs_play::prune::prune;
-use cc4dgs_play::{ArchiveOptions, Model, Moving};
+use cc4dgs_play::{ArchiveOptions, Model, Moving, ViewSource};
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data;
 use cc4dgs_train::train::{RefitJob, TrainJob, TuneJob, Tuner, prune_and_refit, train};
@@ -46,7 +46,8 @@ impl Bench {
     fn archive_as(&self, profile: &str, model: &Model, finetune: usize, tuner: Option<&dyn TuneModel>) -> Result<Vec<u8>> {
         let settings: toml::Table = format!("finetune = {finetune}").parse().unwrap();
         let codec = format!("compact:{profile}");
-        let options = ArchiveOptions { codec: &codec, settings: &settings, field_weights: FIELD_WEIGHTS, scene: Some((&self.scene, &self.device)), tuner };
+        let views = Some((ViewSource::Scene(&self.scene), &self.device));
+        let options = ArchiveOptions { codec: &codec, settings: &settings, field_weights: FIELD_WEIGHTS, views, tuner };
         model.to_archive(&options, &self.registry, &self.limits, &Silent)
     }
     fn tuned(&self, model: &Model, finetune: usize) -> Result<Vec<u8>> {
@@ -213,5 +214,5 @@ fn pruning_with_refit_keeps_fewer_within_the_same_loss() {
 
 fn raw() -> ArchiveOptions<'static> {
     static NONE: std::sync::LazyLock<toml::Table> = std::sync::LazyLock::new(toml::Table::new);
-    ArchiveOptions { codec: "raw", settings: &NONE, field_weights: "fp32", scene: None, tuner: None }
+    ArchiveOptions { codec: "raw", settings: &NONE, field_weights: "fp32", views: None, tuner: None }
 }

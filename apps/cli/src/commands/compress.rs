@@ -9,7 +9,7 @@ use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::source::{Source, SourceKind};
-use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_play::{ArchiveOptions, Model, OrbitViews, ViewSource};
 use cc4dgs_train::eval::SizeMb;
 use cc4dgs_train::train::{TuneJob, Tuner};
 use serde::Serialize;
@@ -110,11 +110,13 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
             stop: &NEVER,
         })
     });
+    let orbit = args.orbit.map(|count| OrbitViews::around(&loaded.model.gaussians, OrbitViews::SIZE, count)).transpose()?;
+    let source = scene.as_deref().map(ViewSource::Scene).or(orbit.as_ref().map(ViewSource::Orbit));
     let options = ArchiveOptions {
         codec: &args.codec,
         settings: &settings,
         field_weights: &args.field_weights,
-        scene: scene.as_deref().map(|scene| (scene, &loaded.device)),
+        views: source.map(|source| (source, &loaded.device)),
         tuner: tuner.as_ref().map(|tuner| tuner as &dyn TuneModel),
     };
     let report = compress(context, &loaded.model, &options, &args.out, &events)?;

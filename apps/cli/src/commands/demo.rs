@@ -58,7 +58,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
 
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
     let loaded = load_model(&args.out, &config.device, &context.registry, &context.limits, &events)?;
-    let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None, tuner: None };
+    let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, views: None, tuner: None };
     let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
 
     let subject = Subject::open(context, &args.out, &loaded, scene_path, &[])?;

@@ -45,7 +45,7 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
             prune_and_refit(&mut loaded.model, &Arc::new(scene), args.max_drop, iterations, &job)?
         }
     };
-    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None, tuner: None };
+    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", views: None, tuner: None };
     let written = compress(context, &loaded.model, &options, &args.out, events)?;
     let report = Report { archive: args.out.clone(), bytes: written.bytes, seconds: began.elapsed().as_secs_f64(), prune: found };
     context.output.result(&report, || text(&report))

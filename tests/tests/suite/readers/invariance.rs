@@ -198,7 +198,7 @@ fn with_points(truth: &Truth, write: Write, change: &Change) -> (tempfile::TempD
 fn exported(model: &Model) -> (DVec3, f64) {
     let (registry, limits, folder) = (Registry::collect().unwrap(), Limits::default(), tempfile::tempdir().unwrap());
     let path = folder.path().join("model.cc4d");
-    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None, tuner: None };
+    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", views: None, tuner: None };
     model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
     let model = Model::open(&path, &registry, &parse_device("flex").unwrap(), &limits, &Silent).unwrap();
     let mut gaussians = model.gaussians.clone();
