@@ -240,7 +240,12 @@ fn without_images_the_difference_between_renders_is_what_was_asked_for() {
         assert!((wanted..wanted + 2.0).contains(&reached), "{bytes} bytes, {reached} dB in place of {wanted}");
     }
     assert!(coarse.0 < usual.0 && usual.0 < fine.0, "{coarse:?}, {usual:?}, {fine:?}");
-    assert!(notes.0.lock().unwrap().iter().any(|n| n.contains("before and after on 4 orbit views (40.00 dB wanted)")));
+    assert!(notes.0.lock().unwrap().iter().any(|n| n.contains("before and after on 4 orbit views (40.00 dB wanted")));
+    // What shows nothing has no differences.
+    let faint = HostGaussians { opacity_logits: vec![-40.0; g.len()], ..g.clone() };
+    let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)("psnr=50dB", &toml::Table::new()).unwrap();
+    let refused = codec.encode(&faint, &context).unwrap_err().to_string();
+    assert!(refused.contains("4 orbit views show nothing") && refused.contains("max-size"), "{refused}");
     // A loss needs images.
     let refused = encode("max-drop=0.05dB").unwrap_err().to_string();
     assert!(refused.starts_with("codec compact.max_drop_db") && refused.contains("--scene"), "{refused}");

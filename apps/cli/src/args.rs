@@ -148,8 +148,8 @@ pub struct Compress {
     /// The dataset that the model was trained on, for codecs that make use of its views; validation views, else training views, judge what is lost.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
-    /// For codecs that make use of views, N of them all round the model, 12 to 512: where its dataset is not there. They see it from outside, so not for rooms
-    /// that are seen from within.
+    /// For codecs that make use of views, N to choose from all round the model, 12 to 512: for an object whose dataset is not there. They see it from outside, so
+    /// not for rooms that are seen from within, nor where surroundings hide what matters.
     #[arg(long, value_name = "N", conflicts_with = "scene", value_parser = parse_orbit)]
     pub orbit: Option<usize>,
     /// The archive to write.

@@ -10,6 +10,8 @@ const FOV_X: f64 = 0.9;
 const ASPECT: f64 = 4.0 / 3.0;
 /// Nearest to a pole that orbiting comes, in radians.
 const POLE: f64 = 0.03;
+/// Nearest to the target that zooming comes, as a share of [`Navigator::unit`]: much nearer, rounding would turn the view, and stop zooming out.
+const NEAREST: f64 = 1e-6;
 
 /// A free camera with a point that it orbits.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,7 +28,10 @@ pub struct Navigator {
     aspect: f64,
     /// Rotation of the camera around its viewing direction that captured cameras may have, in radians; 0 after the user orbits.
     roll: f64,
-    home: Option<Camera>,
+    /// Half the diagonal of the box at the start, 1 at most: lengths that are small in this scene are shares of it.
+    unit: f64,
+    /// Eye, target, vertical angle, aspect and roll at the start.
+    first: (DVec3, DVec3, f64, f64, f64),
 }
 
 impl Navigator {
@@ -38,23 +43,25 @@ impl Navigator {
         let up = shown.up.map_or(DVec3::Z, of).try_normalize().unwrap_or(DVec3::Z);
         let side = up.any_orthonormal_vector();
         let target = shown.target.map_or(middle, of);
-        let mut out =
-            Self { eye: target + 1.8 * radius * (side + 0.35 * up).normalize(), target, up, fov_y: FOV_X, aspect: ASPECT, roll: 0.0, home: shown.home.clone() };
-        out.reset();
+        let eye = target + 1.8 * radius * (side + 0.35 * up).normalize();
+        let first = (eye, target, FOV_X, ASPECT, 0.0);
+        let mut out = Self { eye, target, up, fov_y: FOV_X, aspect: ASPECT, roll: 0.0, unit: radius.min(1.0), first };
+        if let Some(home) = &shown.home {
+            out.go_to(home);
+            out.first = (out.eye, out.target, out.fov_y, out.aspect, out.roll);
+        }
         out
     }
-    /// Back to the home camera.
+    /// Back to the start, with the point that was orbited there.
     pub fn reset(&mut self) {
-        if let Some(home) = self.home.clone() {
-            self.go_to(&home);
-        }
+        (self.eye, self.target, self.fov_y, self.aspect, self.roll) = self.first;
     }
     /// Takes the place of `camera`; the orbited point becomes the one on its axis that is nearest to the old one.
     pub fn go_to(&mut self, camera: &Camera) {
         let eye = DVec3::from(camera.center_world());
         let forward = DVec3::from(camera.forward_world());
         let along = (self.target - eye).dot(forward);
-        let distance = if along > 1e-3 { along } else { (self.target - eye).length().max(1e-2) };
+        let distance = if along > 1e-3 * self.unit { along } else { (self.target - eye).length().max(1e-2 * self.unit) };
         self.eye = eye;
         self.target = eye + distance * forward;
         self.fov_y = 2.0 * (0.5 * f64::from(camera.height) / camera.fy).atan();
@@ -108,11 +115,13 @@ impl Navigator {
         self.eye += by;
         self.target += by;
     }
-    /// Divides the distance to the target by `factor`.
+    /// Divides the distance to the target by `factor`, down to a least distance.
     pub fn zoom(&mut self, factor: f64) {
         if factor.is_finite() && factor > 0.0 {
             let arm = self.eye - self.target;
-            self.eye = self.target + arm / factor.clamp(0.01, 100.0);
+            // A pose of a link may be nearer already; it comes no nearer.
+            let nearest = arm.length().min(NEAREST * self.unit);
+            self.eye = self.target + arm / factor.clamp(0.01, 100.0).min(arm.length() / nearest);
         }
     }
     /// Flies: shares of the distance to the target, to the right, up and forward.
@@ -211,6 +220,40 @@ mod tests {
             let [x, y, z] = seen(&flown);
             assert!(x < 0.0 && y.abs() < 1e-6 && (z - depth).abs() < 1e-9, "flying to the right leads to {x}, {y}");
         }
+    }
+
+    #[test]
+    fn reset_leads_back_to_the_start_with_and_without_a_home_camera() {
+        let shown = Presentation { home: Some(home()), up: Some([0.0, 0.0, 1.0]), target: Some([0.2, 0.1, 0.3]), ..Default::default() };
+        for shown in [Presentation::default(), shown] {
+            let start = Navigator::new(&shown, [-1.0; 3], [1.0; 3]);
+            let mut moved = start.clone();
+            moved.go_to(&Camera::look_at("rolled", (320, 640), 0.5, [1.0, 5.0, 2.0], [0.0; 3], [0.3, 0.1, 1.0]));
+            moved.fly(0.3, 0.1, 1.5);
+            assert_ne!(moved.pose(), start.pose());
+            moved.reset();
+            assert_eq!(moved, start);
+        }
+    }
+
+    #[test]
+    fn small_scenes_are_orbited_in_their_middle() {
+        let home = Camera::look_at("home", (640, 480), 0.8, [3e-5, 1e-5, 2e-5], [2e-6, 1e-6, 3e-6], [0.0, 0.0, 1.0]);
+        let shown = Presentation { home: Some(home), up: Some([0.0, 0.0, 1.0]), target: Some([2e-6, 1e-6, 3e-6]), ..Default::default() };
+        let off = (Navigator::new(&shown, [-1e-5; 3], [1e-5; 3]).target - DVec3::new(2e-6, 1e-6, 3e-6)).length();
+        assert!(off < 1e-9, "{off} away from it");
+    }
+
+    #[test]
+    fn zooming_in_for_long_turns_nothing_and_can_be_undone() {
+        let mut navigator = Navigator::new(&Presentation::default(), [1.0, 2.0, 3.0], [2.0, 3.0, 4.0]);
+        let (forward, distance) = (navigator.forward(), (navigator.eye - navigator.target).length());
+        (0..400).for_each(|_| navigator.zoom(1.2));
+        let near = navigator.pose();
+        assert!((navigator.forward() - forward).length() < 1e-6, "{near:?}");
+        assert!(navigator.set_pose(near));
+        (0..100).for_each(|_| navigator.zoom(1.0 / 1.2));
+        assert!((navigator.forward() - forward).length() < 1e-6 && (navigator.eye - navigator.target).length() > distance, "{:?}", navigator.pose());
     }
 
     #[test]

@@ -79,7 +79,7 @@ export function build(container, player) {
     const stats = element("p", { className: "stats" });
     const panel = element("section", { className: "panel", hidden: true, ...labelled("Settings") },
         element("label", {}, "Camera", camera),
-        element("div", { className: "row" }, button("Reset", "Back to the home camera", () => { camera.value = -1; player.reset(); }), fly),
+        element("div", { className: "row" }, button("Reset", "Back to the first view", () => { camera.value = -1; player.reset(); }), fly),
         ...Object.values(controls).map(c => c.row),
         element("div", { className: "row" }, button("PNG", "Save the image as PNG", () => player.savePng()), share),
         stats);

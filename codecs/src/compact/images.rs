@@ -6,7 +6,7 @@ use cc4dgs_format::{Camera, HostGaussians, RenderModel, Result, TrainingViews};
 pub struct Images<'a> {
     views: Vec<(&'a Camera, f32)>,
     renderer: &'a dyn RenderModel,
-    /// Colours `[3,H,W]` of each view, clamped to 0..1.
+    /// Colours `[3,H,W]` of each view.
     originals: Vec<Vec<f32>>,
 }
 
@@ -18,7 +18,7 @@ impl<'a> Images<'a> {
         renderer.render_views(gaussians, &views, &mut |_, drawn| {
             let mut planes = drawn.planes;
             planes.truncate(3 * drawn.width as usize * drawn.height as usize);
-            planes.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+            planes.shrink_to_fit();
             originals.push(planes);
             Ok(())
         })?;
@@ -28,19 +28,31 @@ impl<'a> Images<'a> {
     pub fn len(&self) -> usize {
         self.views.len()
     }
-    /// The sum over views, pixels and channels of the squared errors of `changed`, whose colours are clamped to 0..1.
+    /// The sum over views, pixels and channels of the squared errors of `changed`.
     pub fn error(&self, changed: &HostGaussians) -> Result<f64> {
+        self.error_of(changed, |v| v)
+    }
+    /// The same of colours that are `shown` as.
+    fn error_of(&self, changed: &HostGaussians, shown: impl Fn(f32) -> f32) -> Result<f64> {
         let mut error = 0.0;
         self.renderer.render_views(changed, &self.views, &mut |k, drawn| {
-            error += self.originals[k].iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum::<f64>();
+            error += self.originals[k].iter().zip(&drawn.planes).map(|(a, b)| f64::from(shown(*a) - shown(*b)).powi(2)).sum::<f64>();
             Ok(())
         })?;
         Ok(error)
     }
-    /// The mean over views, pixels and channels of the squared errors of `changed`; infinite where one is not a number.
+    /// Whether no view shows anything but `background`: no pixel differs by half of an 8-bit step.
+    pub fn show_nothing(&self, background: [f32; 3]) -> bool {
+        let is_plain = |planes: &Vec<f32>| {
+            planes.chunks_exact((planes.len() / 3).max(1)).zip(background).all(|(plane, of)| plane.iter().all(|v| (v - of).abs() < 0.5 / 255.0))
+        };
+        self.originals.iter().all(is_plain)
+    }
+    /// The mean over views, pixels and channels of the squared errors of `changed`, with colours as screens show them, in 0..1; infinite where one is not a
+    /// number.
     pub fn mean_squared_error(&self, changed: &HostGaussians) -> Result<f64> {
         let samples: usize = self.originals.iter().map(Vec::len).sum();
-        let error = self.error(changed)? / samples.max(1) as f64;
+        let error = self.error_of(changed, |v| v.clamp(0.0, 1.0))? / samples.max(1) as f64;
         Ok(if error.is_nan() { f64::INFINITY } else { error })
     }
 }

@@ -15,6 +15,8 @@ const VIEWS: RangeInclusive<usize> = 12..=160;
 const WORK: usize = 2_000_000;
 /// Views whose cameras count for sizes in pixels.
 const CAMERAS: usize = 24;
+/// Depth, world units, from which a camera sees Gaussians of a scene.
+const NEAR: f64 = 0.05;
 /// Width and height of the images that are assumed without views.
 const IMAGE: (f64, f64) = (800.0, 600.0);
 /// Root of the mean squared transmittance in front of a Gaussian that is assumed without a renderer.
@@ -193,13 +195,17 @@ fn pixel_scales(gaussians: &HostGaussians, context: &CodecContext) -> (Vec<f64>,
     let chosen = views.len().min(CAMERAS);
     let cameras: Vec<_> = (0..chosen).map(|k| views.view(k * views.len() / chosen).0).collect();
     let samples = cameras.iter().map(|c| 3.0 * f64::from(c.width) * f64::from(c.height)).sum::<f64>() / chosen as f64;
+    let depth = |m: &[[f64; 4]; 4], mean: &[f32]| (0..3).map(|c| m[2][c] * f64::from(mean[c])).sum::<f64>() + m[2][3];
+    let farthest = cameras.iter().flat_map(|c| gaussians.means.chunks_exact(3).map(|mean| depth(&c.world_to_camera, mean))).fold(0.0, f64::max);
+    // Models may be of any size.
+    let near = NEAR.min(0.1 * farthest);
     let scale = |mean: &[f32]| {
         let (mut sum, mut count) = (0.0, 0.0);
         for camera in &cameras {
             let m = &camera.world_to_camera;
             let at: [f64; 3] = std::array::from_fn(|r| (0..3).map(|c| m[r][c] * f64::from(mean[c])).sum::<f64>() + m[r][3]);
             let (x, y) = (camera.fx * at[0] / at[2] + camera.cx, camera.fy * at[1] / at[2] + camera.cy);
-            if at[2] > 0.05 && (0.0..f64::from(camera.width)).contains(&x) && (0.0..f64::from(camera.height)).contains(&y) {
+            if at[2] > near && (0.0..f64::from(camera.width)).contains(&x) && (0.0..f64::from(camera.height)).contains(&y) {
                 sum += (camera.fx / at[2]).powi(2);
                 count += 1.0;
             }

@@ -1,4 +1,4 @@
-//! Colours rounded together, for the directions that training views see.
+//! Colours rounded together, for the directions from which views see Gaussians.
 //!
 //! Cameras see a Gaussian from some sides only, and functions of direction that are orthogonal over the sphere are not so there: what rounding one coefficient
 //! changes, others can undo. With M, the mean over views of y yᵀ times the weight of the Gaussian in the view, where y are the basis functions at the view's

@@ -1,7 +1,7 @@
 //! `compact`: quantised by what is seen, transformed, predicted, and entropy coded.
 //!
 //! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
-//! the class before. Weights come from derivatives of renders on the training views, or from sizes and opacities. Streams, in the order in which a player
+//! the class before. Weights come from derivatives of renders in views, or from sizes and opacities. Streams, in the order in which a player
 //! needs them: of each layer classes, scales, centres, rotations, opacities and degree-0 colours, then the higher degrees one by one. Layers are sets of
 //! Gaussians by falling weight. Attributes of plug-ins follow the layers.
 

@@ -30,7 +30,8 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         settings.check_without_tuner()?;
     }
     let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !gaussians.is_empty());
-    if !services.is_some_and(|(views, _)| views.has_images()) && !gaussians.is_empty() {
+    let has_images = services.is_some() && context.judging_views().is_some_and(TrainingViews::has_images);
+    if !has_images && !gaussians.is_empty() {
         settings.check_without_views()?;
     }
     let by_size = settings.max_size_mb > 0.0;
@@ -43,7 +44,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     let allowance = match services {
         Some(((views, renderer), whole)) if !by_size => {
             let judges = context.judging_views().unwrap_or(views);
-            let by_drop = settings.max_drop_db > 0.0 && judges.has_images();
+            let by_drop = settings.max_drop_db > 0.0 && has_images;
             let of = if by_drop { judges } else { views };
             let chosen = of.len().min(budget(WORK, gaussians.len(), VIEWS));
             if by_drop {
@@ -51,12 +52,16 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
                 Allowance::Drop { before, limit: settings.max_drop_db, judges, renderer, chosen }
             } else {
                 let images = Images::of(whole, views, renderer, chosen)?;
+                if images.show_nothing(renderer.background()) {
+                    let problem = format!("{chosen} {} views show nothing but the background, so no difference between images can be measured", views.kind());
+                    return Err(Error::parameter(object, problem, "Leave --orbit or --scene out, or bound the size: compact:max-size=5MB"));
+                }
                 Allowance::Difference { limit: libm::pow(10.0, -0.1 * settings.psnr_db), images, kind: views.kind() }
             }
         }
         _ => Allowance::Bytes { limit: bytes_of_file(settings, context)?, context },
     };
-    let tunes = settings.finetune > 0 && services.is_some() && !matches!(allowance, Allowance::Difference { .. });
+    let tunes = settings.finetune > 0 && has_images && !matches!(allowance, Allowance::Difference { .. });
     let tuner = context.tuner.filter(|_| tunes);
     let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();
     if let Some(why) = &caution {
@@ -212,7 +217,9 @@ fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settin
                 }
                 context.events.emit(&Event::Warning { object: object.into(), message: problem });
             }
-            let between = format!("PSNR {reached:.2} dB between images before and after on {views} {kind} views ({wanted:.2} dB wanted)");
+            let between = format!(
+                "PSNR {reached:.2} dB between images before and after on {views} {kind} views ({wanted:.2} dB wanted, the deformer's weights not counted)"
+            );
             note(context, format!("{megabytes:.4} MB of Gaussians, {between}, steps {steps:.3} times the estimated ones{ended}"));
         }
     }

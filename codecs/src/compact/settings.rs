@@ -9,7 +9,7 @@ max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on validat
 max_size_mb = 0.0        # the best Gaussians in a file of at most so many MB, all included; `compact:max-size=5MB` for short. 0: no limit
 finetune = 500           # with --scene: iterations in which Gaussians and deformer are trained further with rounded values, in larger steps; 0: none
 size_weight = 4.0        # how much bits count in fine-tuning; 0 trains for accuracy alone
-psnr_db = 50.0           # PSNR between images before and after, measured with --scene or --orbit, else estimated; `compact:psnr=50dB` for short. It counts where no size is bounded, and no loss, or where no images measure a loss
+psnr_db = 50.0           # PSNR between images before and after, measured with --scene or --orbit (the deformer's weights are not counted), else estimated; `compact:psnr=50dB` for short. It counts where no size is bounded, and no loss, or where no images measure a loss
 rate_weight = 0.0        # how much bits count when colour coefficients above degree 0 are rounded; 0 rounds to the nearest, which is best for images
 measured = true          # with --scene or --orbit: weights from derivatives of renders; false: from sizes and opacities
 adaptive = true          # steps of their own for Gaussians that are seen more or less

@@ -324,7 +324,7 @@ impl Player {
     pub fn fly(&mut self, right: f64, up: f64, forward: f64) {
         self.navigator.fly(right, up, forward);
     }
-    /// Back to the home camera.
+    /// Back to the first view: the home camera, where the file has one.
     pub fn reset(&mut self) {
         self.navigator.reset();
     }

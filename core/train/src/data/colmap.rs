@@ -101,6 +101,22 @@ fn is_complete(folder: &Path, extension: &str) -> bool {
     ["cameras", "images"].iter().all(|stem| folder.join(format!("{stem}.{extension}")).is_file())
 }
 
+/// The folder of the project that the dataset at `path` belongs to: of a COLMAP model in a folder `sparse`, or in a folder of it, the one above `sparse`; else
+/// `path`.
+pub(crate) fn project_folder(path: &Path) -> PathBuf {
+    let is_model = ["cameras.bin", "cameras.txt"].iter().any(|name| path.join(name).is_file());
+    // A path such as `.` has no name.
+    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    let is_sparse = |folder: Option<&Path>| folder.and_then(Path::file_name).is_some_and(|name| name == "sparse");
+    if is_model && is_sparse(Some(whole.as_path())) {
+        path.join("..")
+    } else if is_model && is_sparse(whole.parent()) {
+        path.join("../..")
+    } else {
+        path.to_path_buf()
+    }
+}
+
 struct ColmapModel {
     cameras: BTreeMap<u32, ColmapCamera>,
     images: Vec<ColmapImage>,
@@ -208,11 +224,19 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     Ok(scene)
 }
 
-/// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, in the folder or in `videos/`. Empty unless each image has one of its own.
+/// The footage of the images, in their order. Empty unless each image has a video.
 fn videos(path: &Path, images: &[ColmapImage], options: &SceneOptions, limits: &Limits, warnings: &mut Vec<String>) -> Result<Vec<Footage>> {
+    video::footage(&video_files(path, images, warnings)?, options, limits, warnings)
+}
+
+/// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, in the folder of the project or in its `videos/`, also where `path` is the folder of a
+/// model in `sparse/`. Empty unless each image has one of its own. Hidden files do not count.
+fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) -> Result<Vec<PathBuf>> {
+    let project = project_folder(path);
     let mut by_stem: BTreeMap<String, PathBuf> = BTreeMap::new();
-    for folder in [path.join("videos"), path.to_path_buf()].into_iter().filter(|f| f.is_dir()) {
-        for file in list(&folder, |p| video::is_video(p) && p.is_file())? {
+    // Of two videos of one name, that beside the model counts.
+    for folder in [project.join("videos"), project, path.join("videos"), path.to_path_buf()].into_iter().filter(|f| f.is_dir()) {
+        for file in list(&folder, |p| video::is_video(p) && p.is_file() && !file_name(p).starts_with('.'))? {
             let stem = file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
             by_stem.insert(stem, file);
         }
@@ -228,7 +252,12 @@ fn videos(path: &Path, images: &[ColmapImage], options: &SceneOptions, limits: &
         }
         return Ok(Vec::new());
     }
-    video::footage(&found.into_iter().flatten().collect::<Vec<_>>(), options, limits, warnings)
+    if !by_stem.is_empty() {
+        let names = by_stem.values().take(3).map(|file| file_name(file)).collect::<Vec<_>>().join(", ");
+        let more = if by_stem.len() > 3 { ", …" } else { "" };
+        warnings.push(format!("{} of {available} videos are not used, since the COLMAP model has no image of their name: {names}{more}", by_stem.len()));
+    }
+    Ok(found.into_iter().flatten().collect())
 }
 
 /// The points of a COLMAP model beside another calibration, if both use the same world: every camera must have an image of its name whose
@@ -252,4 +281,40 @@ pub(crate) fn points_in_same_world(path: &Path, cameras: &[RawCamera], limits: &
 
 fn center(m: &Matrix4) -> DVec3 {
     DVec3::from(std::array::from_fn::<f64, 3, _>(|j| -(0..3).map(|i| m[i][j] * m[i][3]).sum::<f64>()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn videos_are_those_of_the_project_and_those_without_an_image_are_told() {
+        let dir = tempfile::tempdir().unwrap();
+        let model = dir.path().join("sparse/1");
+        std::fs::create_dir_all(&model).unwrap();
+        std::fs::create_dir(dir.path().join("videos")).unwrap();
+        std::fs::write(model.join("cameras.bin"), "").unwrap();
+        let film = |name: &str| std::fs::write(dir.path().join("videos").join(name), "").unwrap();
+        for name in ["c0.mp4", "c1.MOV", "._c0.mp4"] {
+            film(name);
+        }
+        let image = |name: &str| ColmapImage { camera: 1, name: name.into(), rotation: [1.0, 0.0, 0.0, 0.0], translation: [0.0; 3] };
+        let images = ["c0.png", "c1.png"].map(image);
+        let found = |path: &Path| {
+            let mut warnings = Vec::new();
+            let files = video_files(path, &images, &mut warnings).unwrap();
+            assert!(files.iter().all(|file| file.is_file()));
+            (files.iter().map(|file| file_name(file)).collect::<Vec<_>>(), warnings.join("\n"))
+        };
+        let both = vec!["c0.mp4".to_string(), "c1.MOV".to_string()];
+        for path in [dir.path(), model.as_path()] {
+            assert_eq!(found(path), (both.clone(), String::new()));
+        }
+        // COLMAP has not registered the image of this camera.
+        film("c2.mp4");
+        for path in [dir.path(), model.as_path()] {
+            let (files, said) = found(path);
+            assert!(files == both && said.contains("1 of 3 videos are not used") && said.contains("c2.mp4"), "{files:?} {said}");
+        }
+    }
 }

@@ -205,10 +205,15 @@ fn least_step(files: &[PathBuf]) -> Option<u64> {
     numbers.windows(2).map(|pair| pair[1] - pair[0]).min().filter(|step| *step > 0)
 }
 
-/// The number at the end of a file's name.
+/// The number at the end of a file's name. Of a name that is a time with decimals, such as `12.040`, all digits count, in units of the last decimal: those after
+/// the point begin anew every second.
 fn frame_number(path: &Path) -> Option<u64> {
     let stem = stem(path);
-    stem[stem.trim_end_matches(|c: char| c.is_ascii_digit()).len()..].parse().ok()
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    match stem.split_once('.') {
+        Some((whole, decimals)) if is_number(whole) && is_number(decimals) => format!("{whole}{decimals}").parse().ok(),
+        _ => stem[stem.trim_end_matches(|c: char| c.is_ascii_digit()).len()..].parse().ok(),
+    }
 }
 
 /// Sorted entries for which `keep` is true; none where there is no folder. Hidden files do not count: on some disks macOS writes a `._cam00.mp4` beside
@@ -216,4 +221,35 @@ fn frame_number(path: &Path) -> Option<u64> {
 fn list_if(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
     let shown = |path: &Path| !file_name(path).starts_with('.') && keep(path);
     if folder.is_dir() { list(folder, shown) } else { Ok(Vec::new()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The images of files of these names, in the order of `list`, and what is said of them.
+    fn read(names: &[&str]) -> (Vec<Option<String>>, Vec<String>) {
+        let mut files: Vec<PathBuf> = names.iter().map(|name| Path::new("cam00").join(name)).collect();
+        files.sort();
+        let (step, mut warnings) = (least_step(&files), Vec::new());
+        let name = |image: Option<ImageSource>| match image {
+            Some(ImageSource::File { path, .. }) => Some(file_name(&path)),
+            _ => None,
+        };
+        (frames(files, step, &mut warnings).into_iter().map(name).collect(), warnings)
+    }
+
+    #[test]
+    fn times_with_decimals_are_in_order_over_whole_seconds() {
+        let in_order = |names: &[&str]| {
+            let (images, said) = read(names);
+            assert!(images.iter().map(Option::as_deref).eq(names.iter().map(|name| Some(*name))) && said.is_empty(), "{images:?} {said:?}");
+        };
+        in_order(&["9.50.png", "9.75.png", "10.00.png", "10.25.png"]);
+        in_order(&["1305031102.175304.png", "1305031102.908411.png", "1305031103.107242.png"]);
+        // A camera and the number of its frame.
+        in_order(&["cam1.8.png", "cam1.9.png", "cam1.10.png"]);
+        let (images, said) = read(&["0.50.png", "0.75.png", "1.25.png", "1.50.png"]);
+        assert!(images.len() == 5 && images[2].is_none() && said[0].contains("1 of 5 frames are missing"), "{images:?} {said:?}");
+    }
 }

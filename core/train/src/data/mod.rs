@@ -33,6 +33,7 @@ mod video;
 
 pub use assemble::assemble;
 pub use camera_box::camera_box;
+pub(crate) use colmap::project_folder;
 pub use hold_out::hold_out;
 pub(crate) use named_files::named_files;
 pub use resample::resize;

@@ -3,7 +3,7 @@
 use super::hash::ContentHash;
 use super::location::locate;
 use super::result::{DataFingerprint, DeviceFacts, TrainingDevice};
-use crate::data::named_files;
+use crate::data::{named_files, project_folder};
 use cc4dgs_core::{Error, Registry, Result, adapters, resolved_device};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -62,17 +62,7 @@ fn root_of(path: &Path) -> PathBuf {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
         return folder.unwrap_or(Path::new(".")).to_path_buf();
     }
-    let is_model = ["cameras.bin", "cameras.txt"].iter().any(|name| path.join(name).is_file());
-    // A path such as `.` has no name.
-    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-    let is_sparse = |folder: Option<&Path>| folder.and_then(Path::file_name).is_some_and(|name| name == "sparse");
-    if is_model && is_sparse(Some(whole.as_path())) {
-        path.join("..")
-    } else if is_model && is_sparse(whole.parent()) {
-        path.join("../..")
-    } else {
-        path.to_path_buf()
-    }
+    project_folder(path)
 }
 
 /// Whether `list` takes the file or folder at `inner` of a dataset for a part of it: hidden ones are left out.

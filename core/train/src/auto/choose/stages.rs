@@ -8,8 +8,9 @@ use toml::Value;
 /// five, 0.3 on its five times as many frames in twenty. In ten, the former gains nothing more, and a long run of mutant with 100,000 Gaussians got worse while
 /// its images were small.
 const IMAGE_GROWTH: f64 = 0.5;
-/// Frames that are learned in such a run.
+/// Frames that are learned in such a run, and up to how many times as many make it longer: more have not been tried.
 const FRAMES: f64 = 30.0;
+const MOST_TIMES: f64 = 5.0;
 /// Weight of strain where one camera at a time sees everything move, from unrelated poses: 0.3 dB on mutant.
 const STRAIN: f64 = 0.03;
 /// Up to so many Gaussians, means learn at their full rate. With 86,000 and more, training views of mutant got worse for a thousand iterations.
@@ -71,6 +72,7 @@ pub(super) fn stages(facts: &Facts, machine: Machine, minutes: f64, most: f64, k
 
 /// Whether a run of a moving scene begins with smaller images: several cameras have more to learn in the same time where there are more frames.
 fn small_images_pay(facts: &Facts, machine: Machine, minutes: f64) -> bool {
-    let parts = if facts.arrangement.has_several_cameras() { (facts.frames as f64 / FRAMES).max(1.0) } else { 1.0 };
-    is_short(machine, minutes / parts)
+    let times = if facts.arrangement.has_several_cameras() { (facts.frames as f64 / FRAMES).clamp(1.0, MOST_TIMES) } else { 1.0 };
+    // What stands still is learned once.
+    is_short(machine, minutes / times.sqrt())
 }
