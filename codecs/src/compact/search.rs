@@ -217,9 +217,8 @@ fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settin
                 }
                 context.events.emit(&Event::Warning { object: object.into(), message: problem });
             }
-            let between = format!(
-                "PSNR {reached:.2} dB between images before and after on {views} {kind} views ({wanted:.2} dB wanted, the deformer's weights not counted)"
-            );
+            let weights = if context.deformer.is_some() { ", the deformer's weights not counted" } else { "" };
+            let between = format!("PSNR {reached:.2} dB between images before and after on {views} {kind} views ({wanted:.2} dB wanted{weights})");
             note(context, format!("{megabytes:.4} MB of Gaussians, {between}, steps {steps:.3} times the estimated ones{ended}"));
         }
     }
