@@ -26,13 +26,14 @@ pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The file as UTF-8 text.
+/// The file as UTF-8 text, without the byte order mark that some programs begin it with.
 ///
 /// # Errors
 /// As [`read_bytes`], and [`Error::Data`] for other text.
 pub fn read_text(path: &Path, limits: &Limits) -> Result<String> {
-    String::from_utf8(read_bytes(path, limits)?)
-        .map_err(|e| Error::data(path.display().to_string(), format!("byte {} is not UTF-8 text", e.utf8_error().valid_up_to()), "Fetch the file again"))
+    let text = String::from_utf8(read_bytes(path, limits)?)
+        .map_err(|e| Error::data(path.display().to_string(), format!("byte {} is not UTF-8 text", e.utf8_error().valid_up_to()), "Fetch the file again"))?;
+    Ok(text.strip_prefix('\u{feff}').map(str::to_string).unwrap_or(text))
 }
 
 /// The JSON document of a file, nested at most `limits.max_depth` deep.
@@ -213,6 +214,17 @@ mod tests {
             is_image(&folder.path().join(name))
         };
         assert!(of("a.png") && of(".b.JPG") && !of("._a.png") && !of("a.txt"));
+    }
+
+    #[test]
+    fn a_byte_order_mark_is_no_text() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.json");
+        for text in ["\u{feff}[1, 2]", "[1, 2]"] {
+            std::fs::write(&path, text).unwrap();
+            assert_eq!(read_text(&path, &Limits::default()).unwrap(), "[1, 2]");
+            assert_eq!(read_json::<Vec<u8>>(&path, &Limits::default()).unwrap(), [1, 2]);
+        }
     }
 
     #[test]

@@ -1,10 +1,13 @@
 //! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA images, times in 0..1. The images of a camera that stands still are its frames.
 
 use super::fixed_cameras::{merge_fixed_cameras, warn_of_missing_times};
-use super::nerfstudio::{Intrinsics, camera, image_path};
+use super::intrinsics::{Intrinsics, camera};
+use super::masks::warn_of_mask_paths;
+use super::nerfstudio::image_path;
 use cc4dgs_core::reader::files::{file_name, image_size, read_json};
 use cc4dgs_core::{Error, ImageSource, InitBox, Limits, Plugin, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 use std::path::Path;
 
 #[derive(Deserialize)]
@@ -21,6 +24,7 @@ struct Frame {
     file_path: String,
     time: Option<f64>,
     transform_matrix: Vec<Vec<f64>>,
+    mask_path: Option<IgnoredAny>,
 }
 
 /// The name of the split to choose settings by.
@@ -52,16 +56,17 @@ fn probe(path: &Path) -> bool {
 fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
     let mut times: Vec<Option<f64>> = Vec::new();
-    read_split(path, "train", Split::Train, limits, &mut scene, &mut times)?;
+    let mut masked = read_split(path, "train", Split::Train, limits, &mut scene, &mut times)?;
     let test = format!("transforms_{}.json", options.test_split);
     if path.join(&test).is_file() {
-        read_split(path, &options.test_split, Split::Test, limits, &mut scene, &mut times)?;
+        masked += read_split(path, &options.test_split, Split::Test, limits, &mut scene, &mut times)?;
     } else {
         scene.warnings.push(format!("there is no {test}; nothing is held out"));
     }
     if options.test_split != VALIDATION && path.join(format!("transforms_{VALIDATION}.json")).is_file() {
-        read_split(path, VALIDATION, Split::Validation, limits, &mut scene, &mut times)?;
+        masked += read_split(path, VALIDATION, Split::Validation, limits, &mut scene, &mut times)?;
     }
+    warn_of_mask_paths(masked, &mut scene.warnings);
     warn_of_missing_times(&times, &mut scene.warnings);
     scene.rank_times(&times, &path.display().to_string())?;
     merge_fixed_cameras(&mut scene, &times, true);
@@ -71,7 +76,8 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     Ok(scene)
 }
 
-fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &mut RawScene, times: &mut Vec<Option<f64>>) -> Result<()> {
+/// Reads one side of the split, and returns how many of its images have a mask.
+fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &mut RawScene, times: &mut Vec<Option<f64>>) -> Result<usize> {
     let file = folder.join(format!("transforms_{name}.json"));
     let object = file.display().to_string();
     let transforms: Transforms = read_json(&file, limits)?;
@@ -82,7 +88,7 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
         if split == Split::Validation {
             // Nothing depends on them, and copies of the dataset leave them out.
             scene.warnings.push(format!("{object}: {problem}; there are no validation views"));
-            return Ok(());
+            return Ok(0);
         }
         return Err(Error::data(object, problem, "Check that the images lie beside the JSON"));
     };
@@ -96,5 +102,5 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::File { path: path.clone(), mask: None } });
         times.push(frame.time);
     }
-    Ok(())
+    Ok(transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count())
 }

@@ -1,7 +1,8 @@
 //! COLMAP models, text or binary, with their sparse points. Every eighth image is held out. Scenes are static, unless each image has a video of its name.
 
 use super::assemble::fit_to_image;
-use super::nerfstudio::{HOLD_OUT_EVERY, LEAST_HELD_OUT, NOTHING_HELD_OUT};
+use super::masks::warn_of_mask_folder;
+use super::nerfstudio::{HOLD_OUT_EVERY, LEAST_HELD_OUT, NOTHING_HELD_OUT, file_named};
 use super::video::{self, Footage};
 use super::{colmap_binary, colmap_text};
 use cc4dgs_core::reader::files::{file_name, list, read_bytes, read_text};
@@ -10,7 +11,7 @@ use cc4dgs_core::{
     Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
 };
 use glam::DVec3;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// A camera record: model, size in pixels, parameters.
@@ -152,7 +153,7 @@ fn read_images(folder: &Path, limits: &Limits) -> Result<Vec<ColmapImage>> {
 /// The folder with the images of a model at `path`.
 fn image_folder(path: &Path, images: &[ColmapImage]) -> PathBuf {
     let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
-    let has_images = |f: &&PathBuf| images.iter().any(|image| f.join(&image.name).is_file());
+    let has_images = |f: &&PathBuf| images.iter().any(|image| file_named(f, &image.name).is_file());
     folders.iter().find(has_images).or_else(|| folders.iter().find(|f| f.is_dir())).unwrap_or(&folders[0]).clone()
 }
 
@@ -160,7 +161,7 @@ fn image_folder(path: &Path, images: &[ColmapImage]) -> PathBuf {
 pub(super) fn image_files(path: &Path, limits: &Limits) -> Vec<PathBuf> {
     let images = model_folder(path).and_then(|folder| read_images(&folder, limits).ok()).unwrap_or_default();
     let folder = image_folder(path, &images);
-    images.iter().map(|image| folder.join(&image.name)).collect()
+    images.iter().map(|image| file_named(&folder, &image.name)).collect()
 }
 
 inventory::submit! {
@@ -196,6 +197,8 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         scene.warnings.push(format!("{read} (to read another, give its folder as the path)"));
     }
     let image_folder = image_folder(path, &images);
+    let beside = if image_folder.ends_with("images") { image_folder.parent() } else { None };
+    warn_of_mask_folder(&[beside.unwrap_or(&image_folder), &project_folder(path)], &mut scene.warnings);
     let hold_out = images.len() >= LEAST_HELD_OUT;
     if !hold_out && options.test_cameras.is_none() {
         scene.warnings.push(NOTHING_HELD_OUT.into());
@@ -218,7 +221,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             continue;
         }
         scene.cameras.push(camera);
-        let source = ImageSource::File { path: image_folder.join(&image.name), mask: None };
+        let source = ImageSource::File { path: file_named(&image_folder, &image.name), mask: None };
         scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, image: source });
     }
     Ok(scene)
@@ -229,16 +232,44 @@ fn videos(path: &Path, images: &[ColmapImage], options: &SceneOptions, limits: &
     video::footage(&video_files(path, images, warnings)?, options, limits, warnings)
 }
 
+/// Whether there is a file that is not hidden.
+fn is_shown(path: &Path) -> bool {
+    path.is_file() && !file_name(path).starts_with('.')
+}
+
 /// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, in the folder of the project or in its `videos/`, also where `path` is the folder of a
 /// model in `sparse/`. Empty unless each image has one of its own. Hidden files do not count.
 fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) -> Result<Vec<PathBuf>> {
     let project = project_folder(path);
+    let own = (project != path).then(|| [path.join("videos"), path.to_path_buf()]);
+    let folders: Vec<PathBuf> = [project.join("videos"), project].into_iter().chain(own.into_iter().flatten()).filter(|f| f.is_dir()).collect();
+    let stem = |file: &Path| file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     let mut by_stem: BTreeMap<String, PathBuf> = BTreeMap::new();
+    let mut pairs = Vec::new();
     // Of two videos of one name, that beside the model counts.
-    for folder in [project.join("videos"), project, path.join("videos"), path.to_path_buf()].into_iter().filter(|f| f.is_dir()) {
-        for file in list(&folder, |p| video::is_video(p) && p.is_file() && !file_name(p).starts_with('.'))? {
-            let stem = file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-            by_stem.insert(stem, file);
+    for folder in &folders {
+        for file in list(folder, |p| video::is_video(p) && is_shown(p))? {
+            let other = by_stem.insert(stem(&file), file.clone());
+            pairs.extend(other.map(|other| format!("{} and {}", other.display(), file.display())));
+        }
+    }
+    if let Some(first) = pairs.first() {
+        let more = if pairs.len() > 1 { ", …" } else { "" };
+        warnings.push(format!("of {} pairs of videos of one name the second is used: {first}{more}", pairs.len()));
+    }
+    if by_stem.is_empty() {
+        let stems: BTreeSet<String> = images.iter().map(|image| stem(Path::new(&image.name))).collect();
+        for folder in folders.iter().filter(|f| f.ends_with("videos")) {
+            let unknown = list(folder, |p| is_shown(p) && stems.contains(&stem(p)))?;
+            if let Some(first) = unknown.first() {
+                warnings.push(format!(
+                    "{} files in {} are not read as videos ({}): the known endings are {}",
+                    unknown.len(),
+                    folder.display(),
+                    file_name(first),
+                    video::ENDINGS.join(", ")
+                ));
+            }
         }
     }
     let available = by_stem.len();
@@ -287,6 +318,35 @@ fn center(m: &Matrix4) -> DVec3 {
 mod tests {
     use super::*;
 
+    fn image(name: &str) -> ColmapImage {
+        ColmapImage { camera: 1, name: name.into(), rotation: [1.0, 0.0, 0.0, 0.0], translation: [0.0; 3] }
+    }
+
+    #[test]
+    fn videos_have_any_usual_ending_and_others_are_told() {
+        let dir = tempfile::tempdir().unwrap();
+        let videos = dir.path().join("videos");
+        std::fs::create_dir(&videos).unwrap();
+        let film = |name: &str| std::fs::write(videos.join(name), "").unwrap();
+        let found = || {
+            let mut warnings = Vec::new();
+            let files = video_files(dir.path(), &[image("c0.png")], &mut warnings).unwrap();
+            (files.iter().map(|file| file_name(file)).collect::<Vec<_>>(), warnings.join("\n"))
+        };
+        film("c0.braw");
+        let (files, said) = found();
+        assert!(files.is_empty() && said.contains("are not read as videos (c0.braw)") && said.contains("m2ts"), "{files:?} {said}");
+        for name in ["c0.MTS", "c0.m2ts", "c0.MP4", "c0.mov", "c0.mkv", "c0.avi", "c0.webm"] {
+            film(name);
+            assert_eq!(found(), (vec![name.to_string()], String::new()));
+            std::fs::remove_file(videos.join(name)).unwrap();
+        }
+        film("c0.MTS");
+        film("c0.mp4");
+        let (files, said) = found();
+        assert!(files == ["c0.mp4"] && said.contains("of 1 pairs of videos of one name") && said.contains("c0.MTS and "), "{files:?} {said}");
+    }
+
     #[test]
     fn videos_are_those_of_the_project_and_those_without_an_image_are_told() {
         let dir = tempfile::tempdir().unwrap();
@@ -298,7 +358,6 @@ mod tests {
         for name in ["c0.mp4", "c1.MOV", "._c0.mp4"] {
             film(name);
         }
-        let image = |name: &str| ColmapImage { camera: 1, name: name.into(), rotation: [1.0, 0.0, 0.0, 0.0], translation: [0.0; 3] };
         let images = ["c0.png", "c1.png"].map(image);
         let found = |path: &Path| {
             let mut warnings = Vec::new();

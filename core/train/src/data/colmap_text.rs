@@ -25,7 +25,12 @@ fn floats<const N: usize>(words: &mut std::str::SplitWhitespace, object: &str, l
 
 /// Lines that are not comments, with their numbers. Empty lines count: an image without points has one.
 fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
-    text.lines().enumerate().filter(|(_, l)| !l.starts_with('#'))
+    text.lines().enumerate().filter(|(_, l)| !l.trim_start().starts_with('#'))
+}
+
+/// What follows the first `count` words of a line, without the white space around it.
+fn after_words(line: &str, count: usize) -> &str {
+    (0..count).fold(line.trim(), |rest, _| rest.split_once(char::is_whitespace).map_or("", |(_, rest)| rest.trim_start()))
 }
 
 /// `cameras.txt`: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[].
@@ -49,6 +54,9 @@ pub(crate) fn cameras(object: &str, text: &str) -> Result<BTreeMap<u32, ColmapCa
     Ok(cameras)
 }
 
+/// How many numbers an image's line has before its name.
+const IMAGE_NUMBERS: usize = 9;
+
 /// `images.txt`: two lines per image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME and its points.
 pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
     let mut images = Vec::new();
@@ -62,7 +70,7 @@ pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
         let rotation = floats(&mut words, object, n)?;
         let translation = floats(&mut words, object, n)?;
         let camera = next(&mut words, object, n)?;
-        let name = words.collect::<Vec<_>>().join(" ");
+        let name = after_words(line, IMAGE_NUMBERS).to_string();
         if name.is_empty() {
             return Err(bad(object, n, "the image has no name"));
         }
@@ -106,5 +114,13 @@ mod tests {
         assert_eq!(with("\n").unwrap().len(), 2);
         let message = with("").unwrap_err().to_string();
         assert!(message.contains("line 3") && message.contains("10 values"), "{message}");
+    }
+
+    #[test]
+    fn names_keep_their_spaces_and_comments_may_be_indented() {
+        let text = "# comment\r\n  # another\r\n1 1 0 0 0  0 0 0\t1 left  camera/\u{e9}t\u{e9} 1.JPG \r\n\r\n2 1 0 0 0 0 0 0 1 b.png";
+        let names: Vec<String> = images("t", text).unwrap().into_iter().map(|image| image.name).collect();
+        assert_eq!(names, ["left  camera/\u{e9}t\u{e9} 1.JPG", "b.png"]);
+        assert!(images("t", "1 1 0 0 0 0 0 0 1 \n\n").unwrap_err().to_string().contains("no name"));
     }
 }

@@ -170,21 +170,24 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     Ok(found)
 }
 
-/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`. Instants are `step` numbers
-/// apart, and one whose number is missing has no image.
+/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`: instants are `step` numbers
+/// apart, and one whose number is missing has no image. Other files come in the order of their names, in which numbers count as numbers: `2_left` before
+/// `10_left`.
 fn frames(mut files: Vec<PathBuf>, step: Option<u64>, warnings: &mut Vec<String>) -> Vec<Option<ImageSource>> {
     let step = step.filter(|_| least_step(&files).is_some());
     let image = |path| Some(ImageSource::File { path, mask: None });
-    if files.iter().all(|path| frame_number(path).is_some()) {
-        files.sort_by_key(|path| frame_number(path));
+    if files.iter().any(|path| frame_number(path).is_none()) {
+        files.sort_by_cached_key(|path| padded(&stem(path)));
+        return files.into_iter().map(image).collect();
     }
+    files.sort_by_key(|path| frame_number(path));
     let numbers: Vec<u64> = files.iter().filter_map(|path| frame_number(path)).collect();
     let steps = || numbers.windows(2).map(|pair| pair[1] - pair[0]);
     let (Some(&first), Some(step)) = (numbers.first(), step) else { return files.into_iter().map(image).collect() };
     let slot = |number: u64| ((number - first) / step) as usize;
     let count = numbers.last().map_or(0, |&last| slot(last).saturating_add(1));
     // Numbers of another meaning, such as times, have no steps or leave most of them out.
-    if numbers.len() < files.len() || steps().any(|s| !s.is_multiple_of(step)) || count > 4 * files.len() {
+    if steps().any(|s| !s.is_multiple_of(step)) || count > 4 * files.len() {
         return files.into_iter().map(image).collect();
     }
     if count > files.len() {
@@ -196,6 +199,23 @@ fn frames(mut files: Vec<PathBuf>, step: Option<u64>, warnings: &mut Vec<String>
         images[slot(number)] = image(path);
     }
     images
+}
+
+/// `name` with its numbers brought to 20 digits, so that their order is that of the texts.
+fn padded(name: &str) -> String {
+    let (mut text, mut number) = (String::new(), String::new());
+    for c in name.chars().map(Some).chain([None]) {
+        if let Some(digit) = c.filter(char::is_ascii_digit) {
+            number.push(digit);
+            continue;
+        }
+        if !number.is_empty() {
+            text += &format!("{number:0>20}");
+            number.clear();
+        }
+        text.extend(c);
+    }
+    text
 }
 
 /// The least difference of the numbers of `files`; none where two are equal, or fewer than two have any.
@@ -247,6 +267,8 @@ mod tests {
         };
         in_order(&["9.50.png", "9.75.png", "10.00.png", "10.25.png"]);
         in_order(&["1305031102.175304.png", "1305031102.908411.png", "1305031103.107242.png"]);
+        // Numbers that do not end the names.
+        in_order(&["2_left.png", "9_left.png", "10_left.png", "100_left.png"]);
         // A camera and the number of its frame.
         in_order(&["cam1.8.png", "cam1.9.png", "cam1.10.png"]);
         let (images, said) = read(&["0.50.png", "0.75.png", "1.25.png", "1.50.png"]);

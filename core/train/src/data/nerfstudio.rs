@@ -4,13 +4,12 @@
 
 use super::assemble::fit_to_image;
 use super::fixed_cameras::{merge_fixed_cameras, warn_of_missing_times};
+use super::intrinsics::{Intrinsics, camera};
+use super::masks::warn_of_mask_paths;
 use super::ply_points;
 use super::video::{self, Footage};
 use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_bytes, read_json};
-use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
-use cc4dgs_core::{
-    Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
-};
+use cc4dgs_core::{Error, ImageSource, Limits, Plugin, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,27 +21,6 @@ pub(crate) const HOLD_OUT_EVERY: usize = 8;
 pub(crate) const LEAST_HELD_OUT: usize = 3;
 /// What is said of fewer.
 pub(crate) const NOTHING_HELD_OUT: &str = "fewer than three images or cameras: none is held out (scene.test_cameras names some)";
-
-/// What a file says of a lens: of all images, or of one.
-#[derive(Clone, Default, Deserialize)]
-pub(crate) struct Intrinsics {
-    camera_angle_x: Option<f64>,
-    camera_angle_y: Option<f64>,
-    fl_x: Option<f64>,
-    fl_y: Option<f64>,
-    cx: Option<f64>,
-    cy: Option<f64>,
-    w: Option<f64>,
-    h: Option<f64>,
-    k1: Option<f64>,
-    k2: Option<f64>,
-    k3: Option<f64>,
-    k4: Option<f64>,
-    p1: Option<f64>,
-    p2: Option<f64>,
-    camera_model: Option<String>,
-    is_fisheye: Option<bool>,
-}
 
 #[derive(Deserialize)]
 struct Transforms {
@@ -67,36 +45,6 @@ struct Frame {
     transform_matrix: Vec<Vec<f64>>,
     time: Option<f64>,
     mask_path: Option<IgnoredAny>,
-}
-
-impl Intrinsics {
-    /// Own values first, then the shared ones.
-    pub(crate) fn over(&self, shared: &Self) -> Self {
-        macro_rules! first {
-            ($($field:ident),*) => { Self { $($field: self.$field.clone().or_else(|| shared.$field.clone())),* } };
-        }
-        first!(camera_angle_x, camera_angle_y, fl_x, fl_y, cx, cy, w, h, k1, k2, k3, k4, p1, p2, camera_model, is_fisheye)
-    }
-    fn distortion(&self) -> Result<Distortion, String> {
-        let radial = [self.k1, self.k2, self.k3, self.k4].map(|k| k.unwrap_or(0.0));
-        let tangential = [self.p1.unwrap_or(0.0), self.p2.unwrap_or(0.0)];
-        match self.camera_model.as_deref().unwrap_or("OPENCV") {
-            "OPENCV_FISHEYE" => Ok(Distortion::Fisheye { radial }),
-            _ if self.is_fisheye == Some(true) => Ok(Distortion::Fisheye { radial }),
-            "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => Ok(Distortion::Brown { radial, tangential }),
-            other => Err(format!("camera model {other:?} is not supported; known are OPENCV, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV_FISHEYE")),
-        }
-    }
-    /// Focal lengths from pixels, or from the angles of view.
-    fn focal(&self, w: f64, h: f64) -> Result<[f64; 2], String> {
-        if let Some(angle) = [self.camera_angle_x, self.camera_angle_y].into_iter().flatten().find(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
-            return Err(format!("camera_angle_x or camera_angle_y is {angle}, not an angle below pi in radians"));
-        }
-        let from_angle = |size: f64, angle: f64| 0.5 * size / (0.5 * angle).tan();
-        let fx = self.fl_x.or_else(|| self.camera_angle_x.map(|a| from_angle(w, a))).or(self.fl_y);
-        let fx = fx.or_else(|| self.camera_angle_y.map(|a| from_angle(h, a))).ok_or("it has neither fl_x nor camera_angle_x")?;
-        Ok([fx, self.fl_y.or_else(|| self.camera_angle_y.map(|a| from_angle(h, a))).unwrap_or(fx)])
-    }
 }
 
 /// The file a JSON names. Backslashes of Windows separate folders, unless a file has them in its name.
@@ -213,10 +161,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if unlisted > 0 {
         scene.warnings.push(format!("{unlisted} images are in none of train_filenames, test_filenames and val_filenames, and were skipped"));
     }
-    let masked = transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count();
-    if masked > 0 {
-        scene.warnings.push(format!("{masked} images have a mask_path; their masks are not used, and all of each image is trained on"));
-    }
+    warn_of_mask_paths(transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count(), &mut scene.warnings);
     if has_times {
         warn_of_missing_times(&times, &mut scene.warnings);
         if times.len() > 1 && times.iter().all(Option::is_none) {
@@ -247,7 +192,7 @@ fn points(object: &str, folder: &Path, named: &str, limits: &Limits) -> Result<R
 }
 
 /// The name of a file without a leading `./`.
-fn plain(name: &str) -> &str {
+pub(super) fn plain(name: &str) -> &str {
     name.trim_start_matches("./")
 }
 
@@ -271,36 +216,6 @@ fn videos(
         return Ok(paths.into_iter().zip(footage).collect());
     };
     Err(Error::data(object, problem, "Write one entry per camera with its video, or one per image"))
-}
-
-/// The camera of the image `name`: its pose is a camera-to-world matrix with OpenGL axes. `image_size` is asked where the file says none.
-pub(crate) fn camera(
-    name: &str,
-    pose: &[Vec<f64>],
-    intrinsics: &Intrinsics,
-    image_size: &dyn Fn() -> Result<(u32, u32)>,
-    bad: &dyn Fn(String) -> Error,
-) -> Result<RawCamera> {
-    let (w, h) = match (intrinsics.w, intrinsics.h) {
-        (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 && w <= 1e6 && h <= 1e6 => (w, h),
-        (None, None) => {
-            let (w, h) = image_size()?;
-            (f64::from(w), f64::from(h))
-        }
-        sides => {
-            let [w, h] = [sides.0, sides.1].map(|side| side.map_or_else(|| "missing".to_string(), |v| v.to_string()));
-            return Err(bad(format!("w is {w} and h is {h}; both must be from 1 to 1000000 pixels, or both left out")));
-        }
-    };
-    let world_to_camera = matrix4(pose).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
-    Ok(RawCamera {
-        name: plain(name).to_string(),
-        size: [w as u32, h as u32],
-        focal: intrinsics.focal(w, h).map_err(bad)?,
-        principal: [intrinsics.cx.unwrap_or(0.5 * w), intrinsics.cy.unwrap_or(0.5 * h)],
-        distortion: intrinsics.distortion().map_err(bad)?,
-        world_to_camera,
-    })
 }
 
 #[cfg(test)]

@@ -69,6 +69,32 @@ fn colmap_images_are_where_their_names_are_and_other_models_are_named() {
 }
 
 #[test]
+fn masks_beside_the_images_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    write_colmap(dir.path());
+    let told = |path: &std::path::Path| {
+        let scene = load(path).unwrap();
+        scene.warnings.iter().filter(|w| w.contains("masks")).cloned().collect::<Vec<_>>()
+    };
+    assert!(told(dir.path()).is_empty());
+    write_image(&dir.path().join("masks/0.png"), 16, 12, 0);
+    for path in [dir.path().to_path_buf(), dir.path().join("sparse/0")] {
+        let said = told(&path);
+        assert!(said.len() == 1 && said[0].contains("are not used") && said[0].contains("alpha channel"), "{said:?}");
+    }
+}
+
+#[test]
+fn texts_from_windows_are_read() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("cameras.txt"), "\u{feff}# Cameras\r\n1 SIMPLE_PINHOLE 64 48 60 32 24\r\n").unwrap();
+    std::fs::write(dir.path().join("images.txt"), "\u{feff}# Images\r\n1 1 0 0 0 0 0 0 1 left  camera\\a.PNG\r\n\r\n").unwrap();
+    write_image(&dir.path().join("images/left  camera/a.PNG"), 64, 48, 9);
+    let scene = load(dir.path()).unwrap();
+    assert_eq!((scene.views.len(), scene.frame(0).unwrap().data[2]), (1, 9));
+}
+
+#[test]
 fn colmap_lenses_are_undone() {
     for (model, parameters) in [
         ("SIMPLE_PINHOLE", "60 32 24"),

@@ -269,6 +269,49 @@ fn a_lens_beside_the_angle_of_view_counts_in_split_files_too() {
     assert!((test.fx - 8.0 / 0.4f64.tan()).abs() < 1e-9 && test.cx == 8.0);
 }
 
+/// Changes a JSON file.
+fn change(file: &std::path::Path, with: impl Fn(&mut serde_json::Value)) {
+    let mut document: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    with(&mut document);
+    std::fs::write(file, document.to_string()).unwrap();
+}
+
+#[test]
+fn a_list_of_distortion_parameters_is_read_or_refused() {
+    let opened = |key: &str, value: serde_json::Value| {
+        let dir = tempfile::tempdir().unwrap();
+        write_nerfstudio(dir.path(), 4);
+        change(&dir.path().join("transforms.json"), |document| document[key] = value.clone());
+        load(dir.path()).map(|scene| (scene.camera(0).width, scene.camera(0).height, scene.camera(0).cx))
+    };
+    let named = opened("k1", 0.3.into()).unwrap();
+    assert!(named.0 < 16, "{named:?}");
+    assert_eq!(opened("distortion_params", serde_json::json!([0.3, 0, 0, 0, 0, 0])).unwrap(), named);
+    let message = opened("distortion_params", serde_json::json!([0.3, 0, 0, 0])).unwrap_err().to_string();
+    assert!(message.contains("images/0000.png") && message.contains("distortion_params has 4 numbers"), "{message}");
+}
+
+#[test]
+fn mask_paths_are_told_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let mask = |file: &std::path::Path| change(file, |document| document["frames"][0]["mask_path"] = "masks/0.png".into());
+    let told = |path: &std::path::Path| {
+        let scene = load(path).unwrap();
+        scene.warnings.iter().filter(|w| w.contains("mask_path")).cloned().collect::<Vec<_>>()
+    };
+    let [studio, split] = ["studio", "split"].map(|name| dir.path().join(name));
+    write_nerfstudio(&studio, 4);
+    write_dnerf(&split, 3, 1, 16);
+    assert!(told(&studio).is_empty() && told(&split).is_empty());
+    mask(&studio.join("transforms.json"));
+    mask(&split.join("transforms_train.json"));
+    mask(&split.join("transforms_test.json"));
+    for (path, count) in [(studio, 1), (split, 2)] {
+        let said = told(&path);
+        assert!(said.len() == 1 && said[0].starts_with(&format!("{count} images have a mask_path")) && said[0].contains("alpha channel"), "{said:?}");
+    }
+}
+
 #[test]
 fn names_of_a_split_may_begin_with_a_dot() {
     let dir = tempfile::tempdir().unwrap();

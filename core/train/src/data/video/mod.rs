@@ -28,9 +28,12 @@ const EXTRACT: &str = "extract the frames yourself: into a folder per camera (ca
 /// The most bytes of messages that are read from a command.
 const MESSAGES: u64 = 1 << 16;
 
+/// The endings of videos, in lower case: of the containers that cameras and programs write and ffmpeg reads.
+pub(super) const ENDINGS: [&str; 16] = ["3gp", "avi", "flv", "m2ts", "m4v", "mkv", "mov", "mp4", "mpeg", "mpg", "mts", "mxf", "ogv", "ts", "webm", "wmv"];
+
 /// Whether the extension is that of a video.
 pub(super) fn is_video(path: &Path) -> bool {
-    has_extension(path, &["mp4", "mov", "m4v", "mkv", "webm", "avi"])
+    has_extension(path, &ENDINGS)
 }
 
 /// A video on the clock of its scene.
