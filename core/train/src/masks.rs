@@ -85,14 +85,14 @@ pub(crate) fn blur(image: &[f32], w: usize, h: usize, sigma: f32) -> Vec<f32> {
         (if i >= n as isize { period - i } else { i }).clamp(0, n as isize - 1) as usize
     };
     let pass = |source: &[f32], along: usize, across: usize, stride: usize, step: usize| -> Vec<f32> {
+        // Where the values lie that a line and its margins show: found once, because it takes a division.
+        let shown: Vec<usize> = (-radius..along as isize + radius).map(|i| mirror(i, along) * step).collect();
         // Returns [across, along] row-major lines.
         (0..across)
             .into_par_iter()
             .flat_map_iter(|line| {
-                let kernel = &kernel;
-                (0..along).map(move |i| {
-                    (0..kernel.len()).map(|k| kernel[k] * source[line * stride + mirror(i as isize + k as isize - radius, along) * step]).sum::<f32>()
-                })
+                let (kernel, shown, line) = (&kernel, &shown, &source[line * stride..]);
+                (0..along).map(move |i| kernel.iter().zip(&shown[i..]).map(|(weight, &at)| weight * line[at]).sum::<f32>())
             })
             .collect()
     };
@@ -115,5 +115,34 @@ mod tests {
         assert!((blurred.iter().sum::<f32>() - 1.0).abs() < 1e-4);
         assert_eq!(blurred[50 * 101 + 47], blurred[47 * 101 + 50]);
         assert_eq!(blur(&[0.3], 1, 1, 5.0).len(), 1);
+    }
+
+    #[test]
+    fn edges_are_mirrored_without_repeating_the_border_pixel() {
+        let mirrored = |mut i: isize, n: usize| {
+            let last = n as isize - 1;
+            while !(0..=last).contains(&i) {
+                i = if i < 0 { -i } else { 2 * last - i };
+                // A single pixel is its own mirror image.
+                i = if last == 0 { 0 } else { i };
+            }
+            i as usize
+        };
+        // The kernel reaches further than the image is wide, or high.
+        for (w, h) in [(1, 1), (2, 5), (7, 3), (13, 11)] {
+            let image: Vec<f32> = (0..w * h).map(|p| (p as f32 * 0.7).sin()).collect();
+            let weights: Vec<f64> = (-6..=6).map(|d: i32| (-f64::from(d * d) / 8.0).exp()).collect();
+            let norm = weights.iter().sum::<f64>().powi(2);
+            for (p, found) in blur(&image, w, h, 2.0).into_iter().enumerate() {
+                let mut sum = 0.0;
+                for (dy, a) in weights.iter().enumerate() {
+                    for (dx, b) in weights.iter().enumerate() {
+                        let (x, y) = (mirrored((p % w + dx) as isize - 6, w), mirrored((p / w + dy) as isize - 6, h));
+                        sum += a * b * f64::from(image[y * w + x]) / norm;
+                    }
+                }
+                assert!((f64::from(found) - sum).abs() < 2e-6, "pixel {p} of {w}x{h}: {found} instead of {sum}");
+            }
+        }
     }
 }

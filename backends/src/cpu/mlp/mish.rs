@@ -32,9 +32,9 @@ impl Block {
         let hidden = shape.hidden.iter().map(|&h| (scratch(BLOCK * h), scratch(BLOCK), scratch(BLOCK * h))).collect();
         Self { input: scratch(BLOCK * shape.input), hidden, output: scratch(BLOCK * shape.output), work: scratch(shape.widest()) }
     }
-    /// Fills the input with `count` rows and zeros, and computes everything.
+    /// Fills the input with `count` rows and zeros, and computes `layers`: all of them, or those before the last.
     fn forward(&mut self, layers: &[MishLayer], weights: &[f32], rows: &RowSource, first: usize, count: usize) {
-        let width = layers[0].input;
+        let width = self.input.len() / BLOCK;
         rows(first, &mut self.input[..count * width]);
         self.input[count * width..].fill(0.0);
         let mut input: &[f32] = &self.input;
@@ -80,7 +80,7 @@ pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSourc
 }
 
 /// The gradient of the weights given `grad` `[rows, output]`, and, if `input_grad` `[rows, input]` is given, the gradient of the inputs.
-/// Activations are recomputed instead of saved: at these widths that is cheaper than writing and reading them.
+/// Activations are recomputed instead of saved: at these widths that is cheaper than writing and reading them. The outputs are not needed.
 pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource, grad: &[f32], input_grad: Option<&mut [f32]>) -> Vec<f32> {
     let layers = shape.layers();
     if count == 0 {
@@ -100,7 +100,7 @@ pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSour
         let mut g = [scratch(BLOCK * shape.widest()), scratch(BLOCK * shape.widest())];
         for (b, grad) in grad.chunks(BLOCK * shape.output).enumerate() {
             let count = grad.len() / shape.output;
-            block.forward(&layers, weights, rows, i * run + b * BLOCK, count);
+            block.forward(&layers[..shape.hidden.len()], weights, rows, i * run + b * BLOCK, count);
             g[0][..grad.len()].copy_from_slice(grad);
             g[0][grad.len()..BLOCK * shape.output].fill(0.0);
             block_backward(&layers, weights, &back, &mut block, &mut g, &mut total, wants_input);
@@ -140,5 +140,27 @@ fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], bloc
             matmul(to, from, &back[i], (BLOCK, layer.output, layer.input), false);
             g.swap(0, 1);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_output_layer_is_left_out_where_it_is_not_wanted() {
+        let shape = MishShape { input: 7, hidden: vec![12, 9], output: 5 };
+        let (layers, count) = (shape.layers(), shape.parameter_count());
+        let weights: Vec<f32> = (0..count).map(|k| (k as f32 * 0.7).sin()).collect();
+        let rows = |first: usize, out: &mut [f32]| out.iter_mut().enumerate().for_each(|(k, v)| *v = ((7 * first + k) as f32 * 0.3).sin());
+        let run = |layers: &[MishLayer]| {
+            let mut block = Block::new(&shape);
+            block.output.fill(f32::MAX);
+            block.forward(layers, &weights, &rows, 0, BLOCK);
+            (block.hidden[1].2.to_vec(), block.output.to_vec())
+        };
+        let (all, hidden) = (run(&layers), run(&layers[..2]));
+        assert!(all.1.iter().all(|v| *v < f32::MAX) && hidden.1.iter().all(|v| *v == f32::MAX));
+        assert!(all.0 == hidden.0 && all.0.iter().any(|v| *v != 0.0));
     }
 }

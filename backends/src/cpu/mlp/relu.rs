@@ -39,9 +39,9 @@ fn padded(values: &[f32], len: usize) -> Option<Scratch> {
     })
 }
 
-/// The outputs of all layers for one block `x` `[BLOCK, input]`.
-fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], outputs: &mut [Scratch]) {
-    for (i, layer) in layers.iter().enumerate() {
+/// The outputs of the layers for one block `x` `[BLOCK, input]`: of all of them, or with `hidden` of those that end in a ReLU. No layer reads the others.
+fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], outputs: &mut [Scratch], hidden: bool) {
+    for (i, layer) in layers.iter().enumerate().filter(|(_, layer)| layer.relu || !hidden) {
         let (before, rest) = outputs.split_at_mut(i);
         let out: &mut [f32] = &mut rest[0];
         let input: &[f32] = layer.parent.map_or(x, |p| &before[p]);
@@ -68,7 +68,7 @@ pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
     row_blocks(&mut out, &widths, count, BLOCK).into_par_iter().zip(x.par_chunks(BLOCK * shape.input)).for_each(|(mut outs, x)| {
         let count = x.len() / shape.input;
         let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
-        block_forward(&layers, weights, padded(x, BLOCK * shape.input).as_deref().unwrap_or(x), &mut outputs);
+        block_forward(&layers, weights, padded(x, BLOCK * shape.input).as_deref().unwrap_or(x), &mut outputs, false);
         for (layer, output) in layers.iter().zip(&outputs) {
             if let Some(slot) = layer.slot {
                 outs[slot].copy_from_slice(&output[..count * layer.output]);
@@ -79,7 +79,7 @@ pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
 }
 
 /// The gradients `(x [rows, input], weights)` given that of the flat outputs; the first is empty unless `wants_input`.
-/// Activations are recomputed instead of saved.
+/// Activations are recomputed instead of saved; the flat outputs are not needed.
 pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wants_input: bool) -> (Vec<f32>, Vec<f32>) {
     let layers = shape.layers();
     let count = x.len() / shape.input.max(1);
@@ -98,7 +98,7 @@ pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wan
         for (b, x) in x.chunks(BLOCK * shape.input).enumerate() {
             let (rows, whole) = (x.len() / shape.input, padded(x, BLOCK * shape.input));
             let inputs = whole.as_deref().unwrap_or(x);
-            block_forward(&layers, weights, inputs, &mut outputs);
+            block_forward(&layers, weights, inputs, &mut outputs, true);
             let first = i * run + b * BLOCK;
             load_output_grads(&layers, &mut grads, grad, count, first, rows);
             let sink = if wants_input { &mut sink[b * BLOCK * shape.input..][..x.len()] } else { &mut sink[..0] };
@@ -180,6 +180,27 @@ mod tests {
             let (first, second, of_input) = run(rows);
             assert!(first == whole.0[..rows * 3] && second == whole.1[..rows * 11], "outputs of {rows} rows");
             assert!(of_input == whole.2[..rows * 9], "gradient of {rows} rows");
+        }
+    }
+
+    #[test]
+    fn what_no_layer_reads_is_left_out_where_it_is_not_wanted() {
+        let heads = ReluShape { input: 9, trunk: vec![33, 20], heads: vec![vec![24, 3], vec![11]] };
+        let trunk = ReluShape { input: 9, trunk: vec![33, 20], heads: Vec::new() };
+        let numbers = |count: usize, step: f32| (0..count).map(|k| (k as f32 * step).sin() * 0.4).collect::<Vec<f32>>();
+        for shape in [heads, trunk] {
+            let layers = shape.layers();
+            let (weights, x) = (numbers(shape.parameter_count(), 0.91), numbers(BLOCK * 9, 0.37));
+            let run = |hidden: bool| {
+                let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
+                outputs.iter_mut().for_each(|output| output.fill(f32::MAX));
+                block_forward(&layers, &weights, &x, &mut outputs, hidden);
+                outputs.iter().map(|output| output.to_vec()).collect::<Vec<Vec<f32>>>()
+            };
+            for (layer, (all, hidden)) in layers.iter().zip(run(false).into_iter().zip(run(true))) {
+                assert!(all.iter().all(|v| *v < f32::MAX), "{layer:?}");
+                assert!(if layer.relu { hidden == all } else { hidden.iter().all(|v| *v == f32::MAX) }, "{layer:?}");
+            }
         }
     }
 }
