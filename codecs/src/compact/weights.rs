@@ -128,6 +128,21 @@ fn code<C: Coder>(coder: &mut C, (index, arrays): (usize, usize), form: Form, sh
     Ok(())
 }
 
+/// Codes nothing: what it is given comes back at once.
+struct Uncoded;
+
+impl Coder for Uncoded {
+    const WRITES: bool = true;
+    #[inline(always)]
+    fn symbol(&mut self, _: usize, _: usize, symbol: usize) -> Result<usize> {
+        Ok(symbol)
+    }
+    #[inline(always)]
+    fn bits(&mut self, count: u32, value: u64) -> Result<u64> {
+        Ok(value & ((1 << count) - 1))
+    }
+}
+
 /// Derivatives of the estimated bits of a row by its values, in steps: for distributions that fall by the factor ρ from one magnitude to the next, each is -log2 ρ.
 fn bit_slopes(row: &[f32], step: f64) -> impl Iterator<Item = f32> {
     let mean = (row.iter().map(|v| f64::from(v.abs())).sum::<f64>() / (row.len().max(1) as f64 * step)).max(LEAST_MAGNITUDE);
@@ -184,6 +199,16 @@ impl WeightCodec for Weights {
         }
         coder.finish()?;
         Ok(arrays)
+    }
+    fn round(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Vec<WeightArray>> {
+        // Refuses what `encode` refuses.
+        write_shapes(weights, &mut Vec::new())?;
+        let mut rounded = weights.to_vec();
+        for (index, (array, found)) in weights.iter().zip(&mut rounded).enumerate() {
+            let (form, shifts) = self.form(index, array, context);
+            code(&mut Uncoded, (index, weights.len()), form, &shifts, &mut found.values)?;
+        }
+        Ok(rounded)
     }
     fn steps(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Option<WeightSteps>> {
         let mut out = WeightSteps::default();

@@ -31,6 +31,14 @@ pub trait WeightCodec: Send + Sync {
     fn encode(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Vec<Stream>>;
     /// Decodes what [`WeightCodec::encode`] wrote: the same names and shapes in the same order, finite values. Bytes are untrusted: an error, never a panic.
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>>;
+    /// `weights` as they come back from [`WeightCodec::encode`] and [`WeightCodec::decode`], to the bit. A training that goes on while weights are rounded asks for
+    /// it in every iteration: say how where that takes less time than coding.
+    ///
+    /// # Errors
+    /// As [`WeightCodec::encode`].
+    fn round(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Vec<WeightArray>> {
+        self.decode(&self.encode(weights, context)?, context)
+    }
     /// How far apart values that can be stored are, for a training that goes on while they are rounded; `None` where the codec does not say.
     ///
     /// # Errors

@@ -12,6 +12,7 @@ const DAMAGES: usize = 48;
 /// - Its schema is TOML that it accepts; unknown settings are refused by name.
 /// - Names, shapes and their order are kept; the error of every value is at most the declared one.
 /// - Equal weights give equal bytes.
+/// - Rounding gives what comes back, to the bit; so it is with [`CodecContext::weight_importance`], too.
 /// - Where it states its steps, no value is further from what comes back than half of one; so it is with [`CodecContext::weight_importance`], too.
 /// - Duplicate names, shapes that do not match the values and values that are not finite are refused.
 /// - Damaged streams give an error or valid weights, never a panic.
@@ -31,8 +32,10 @@ pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<S
     note("settings", settings_are_read("weight codec", &plugin.info, settings, |settings| (plugin.build)(settings).map(drop)));
     note("weights", comes_back(codec, &weights()));
     note("no weights", comes_back(codec, &[]));
+    note("rounding", rounds_alike(codec, &context()));
     note("steps", keeps_steps(codec, &context()));
     let importance = importance();
+    note("rounding by importance", rounds_alike(codec, &CodecContext { weight_importance: Some(&importance), ..context() }));
     note("steps by importance", keeps_steps(codec, &CodecContext { weight_importance: Some(&importance), ..context() }));
     note("repeats", repeats(codec));
     note("invalid weights", refuses_unsound(codec));
@@ -88,6 +91,14 @@ fn importance() -> Vec<Vec<f32>> {
         (0..array.values.len()).map(|k| if k % 96 < 32 { 0.0 } else { libm::exp(20.0 * f64::from(uniform(seed, k / 16))) as f32 }).collect()
     };
     weights().iter().map(of).collect()
+}
+
+fn rounds_alike(codec: &dyn WeightCodec, context: &CodecContext) -> Result<Option<String>> {
+    let given = weights();
+    let (rounded, decoded) = (codec.round(&given, context)?, codec.decode(&codec.encode(&given, context)?, &self::context())?);
+    let bits = |array: &WeightArray| (array.name.clone(), array.shape.clone(), array.values.iter().map(|v| v.to_bits()).collect::<Vec<_>>());
+    let other = rounded.len() != decoded.len() || rounded.iter().zip(&decoded).any(|(a, b)| bits(a) != bits(b));
+    Ok(other.then(|| "rounding gives other weights than encoding and decoding".into()))
 }
 
 fn keeps_steps(codec: &dyn WeightCodec, context: &CodecContext) -> Result<Option<String>> {
@@ -172,4 +183,62 @@ fn survives_damage(codec: &dyn WeightCodec) -> Result<Option<String>> {
         }
     }
     Ok(None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::storage::{StreamSet, read_shapes, value_count, write_shapes};
+    use crate::{Error, Plugin};
+
+    /// Float32, with a rounding that is right, or wrong in one array.
+    struct Plain {
+        right: bool,
+    }
+
+    impl WeightCodec for Plain {
+        fn encode(&self, weights: &[WeightArray], _: &CodecContext) -> Result<Vec<Stream>> {
+            let mut bytes = Vec::new();
+            write_shapes(weights, &mut bytes)?;
+            bytes.extend(weights.iter().flat_map(|array| &array.values).flat_map(|v| v.to_le_bytes()));
+            Ok(vec![Stream { name: "all".into(), bytes }])
+        }
+        fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>> {
+            let mut reader = StreamSet::new("plain", streams).reader("all")?;
+            let mut arrays = read_shapes(&mut reader, &context.limits)?;
+            for array in &mut arrays {
+                array.values = reader.f32s(value_count(&array.shape).unwrap_or(0))?;
+            }
+            reader.finish()?;
+            Ok(arrays)
+        }
+        fn round(&self, weights: &[WeightArray], _: &CodecContext) -> Result<Vec<WeightArray>> {
+            let mut rounded = weights.to_vec();
+            if !self.right {
+                rounded[2].values[7] += 1e-6;
+            }
+            Ok(rounded)
+        }
+        fn loss(&self) -> f64 {
+            0.0
+        }
+    }
+
+    fn build(settings: &toml::Table, right: bool) -> Result<Box<dyn WeightCodec>> {
+        match settings.keys().next() {
+            Some(key) => Err(Error::parameter("plain", format!("there is no setting {key}"), "Leave it out")),
+            None => Ok(Box::new(Plain { right })),
+        }
+    }
+
+    #[test]
+    fn a_rounding_that_is_not_what_comes_back_is_found() {
+        let findings = |build: fn(&toml::Table) -> Result<Box<dyn WeightCodec>>| {
+            let info = Plugin { name: "plain", version: "1", summary: "", paper: "", schema: "# no settings\n", capabilities: &[] };
+            weight_codec(&WeightCodecPlugin { info, build }, &toml::Table::new())
+        };
+        assert_eq!(findings(|settings| build(settings, true)), Vec::<String>::new());
+        let found = findings(|settings| build(settings, false));
+        assert!(found.len() == 2 && found.iter().all(|line| line.contains("rounding gives other weights")), "{found:?}");
+    }
 }

@@ -46,8 +46,7 @@ impl StoredWeights {
         if weights.is_empty() {
             return Ok(Vec::new());
         }
-        let context = self.context(job);
-        codec.decode(&codec.encode(weights, &context)?, &context)
+        codec.round(weights, &self.context(job))
     }
     /// The steps of `weights`, where their codec states them and they were searched, and derivatives of the size per step, each bit counted as `per_bit`.
     pub fn scales(&self, job: &TuneJob, weights: &[WeightArray], codec: &dyn WeightCodec, per_bit: f64) -> Result<Option<Vec<Option<WeightScale>>>> {
