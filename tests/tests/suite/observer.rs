@@ -32,7 +32,8 @@ impl Observer for Looker {
 /// Trains into `out` and returns the checkpoint's bytes.
 fn run(out: &Path, observer: Option<&dyn Observer>) -> Vec<u8> {
     let session = Session::builder().device("flex").build().unwrap();
-    let sets = ["train.iterations=120", "train.checks=false", "train.log_every=5", "deformer.kind=cdf-basis", "deformer.unused=0.0"].map(String::from);
+    let sets = ["train.iterations=120", "train.batch=2", "train.checks=false", "train.log_every=5", "deformer.kind=cdf-basis", "deformer.unused=0.0"];
+    let sets = sets.map(String::from);
     let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
     let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
     let (registry, events, stop) = (session.registry(), session.events(), &AtomicBool::new(false));
@@ -51,6 +52,7 @@ fn a_training_that_is_watched_ends_in_the_same_bytes() {
     // The last snapshot is the trained model, at its keyframes.
     let last = looker.last.lock().unwrap().take().unwrap();
     assert_eq!((last.standing.stage, last.standing.iteration, last.moved.len()), (Stage::Main, last.standing.of, KEYFRAMES));
+    assert_eq!(last.standing.views, 2);
     let session = Session::builder().device("flex").build().unwrap();
     let model = session.open(&watched).unwrap();
     assert!(last.gaussians.means == model.gaussians.means && !last.rows.is_empty());

@@ -240,7 +240,8 @@ fn for_density_of(layers: &Layers, asked: &RunConfig, mut choice: Choice, regist
     Ok(choice)
 }
 
-/// How many views share a pass through the field, and the iterations for which the plan has `left` some of its `minutes`. `batch` is the number that the user stated.
+/// How many views share a pass through the field, and the iterations for which the plan has `left` some of its `minutes`. `batch` is the number that the user stated;
+/// of more than the scene has, training draws all.
 fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left: f64, batch: Option<usize>) -> Vec<Choice> {
     let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
     let main = config.train.shares[2] / total;
@@ -254,7 +255,7 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
     let shared = (field / (FIELD_VIEWS * view)).round().clamp(1.0, MOST_VIEWS);
     let noisy = facts.arrangement == Arrangement::OneCameraAnywhere && moving > 0.0;
     let steady = (1..=STEADY_VIEWS).rev().map(|views| views as f64).find(|&views| noisy && fit(views) >= STEADY).unwrap_or(1.0);
-    let wanted = batch.map_or(shared.max(steady), |batch| batch as f64);
+    let wanted = batch.map_or(shared.max(steady), |batch| batch as f64).min(facts.views.max(1) as f64);
     let mut views = wanted;
     while batch.is_none() && views > 1.0 && fit(views) < ENOUGH {
         views -= 1.0;
@@ -306,17 +307,17 @@ mod tests {
 
     /// Views per iteration and iterations where `left` minutes are left, with the times that `cdf` took on the capture `turntable`.
     fn planned(left: f64, batch: Option<usize>) -> (i64, i64) {
-        planned_for(Arrangement::OneCameraAnywhere, 193.0, left, batch)
+        planned_for(Arrangement::OneCameraAnywhere, 100, 193.0, left, batch)
     }
 
-    /// As [`planned`], where views share `shared` ms.
-    fn planned_for(arrangement: Arrangement, shared: f64, left: f64, batch: Option<usize>) -> (i64, i64) {
+    /// As [`planned`], of so many training `views` that share `shared` ms.
+    fn planned_for(arrangement: Arrangement, views: usize, shared: f64, left: f64, batch: Option<usize>) -> (i64, i64) {
         let registry = Registry::collect().unwrap();
         let mut config = Layers::collect(&registry, Some(PRESET), None, &[]).unwrap().config().unwrap();
         (config.train.shares, config.train.dynamic) = ([2.0, 0.0, 18.0], Dynamic::All);
         let facts = Facts {
             arrangement,
-            views: 100,
+            views,
             cameras: 64,
             frames: 120,
             size: [192, 192],
@@ -346,8 +347,16 @@ mod tests {
     }
 
     #[test]
+    fn an_iteration_is_planned_with_no_more_views_than_there_are() {
+        let of = |views, batch| planned_for(Arrangement::OneCameraAnywhere, views, 193.0, 12.0, batch);
+        assert_eq!(of(3, Some(64)), of(100, Some(3)), "training draws three");
+        assert_eq!(of(3, None), of(100, Some(3)));
+        assert_eq!((of(1, None).0, of(1, Some(4)).0), (1, 1));
+    }
+
+    #[test]
     fn iterations_have_several_views_where_one_camera_at_a_time_sees_everything_move() {
-        let views = |arrangement, left| planned_for(arrangement, 10.0, left, None).0;
+        let views = |arrangement, left| planned_for(arrangement, 100, 10.0, left, None).0;
         let found = [2.0, 3.2, 4.5, 6.0, 9.0].map(|left| views(Arrangement::OneCameraAnywhere, left));
         assert_eq!(found, [1, 2, 3, 4, 4], "as many as leave 1,500 iterations");
         assert_eq!(views(Arrangement::OneMovingCamera, 9.0), 1);

@@ -15,11 +15,13 @@ const MEASUREMENTS: usize = 3;
 const ITERATIONS: usize = 4;
 
 /// The share of an iteration of `model`'s main stage that its views do not share, 0 to 1: with `v` of it, an iteration of `k` views takes `1 + (k - 1) v` times
-/// as long as one of a single view. Found by training for a few iterations with `views` views and with one; the result is forgotten.
+/// as long as one of a single view. Found by training for a few iterations with `views` views, or as many as the scene has, and with one; the result is forgotten.
+/// 0 where there is only one view.
 ///
 /// # Errors
 /// [`Error::Backend`] for what is not finite, and what scene and plug-ins report.
 pub(crate) fn share_per_view(model: &Model, scene: &Arc<Scene>, views: usize, registry: &Registry) -> Result<f64> {
+    let views = views.min(scene.split(Split::Train).len());
     let stop = AtomicBool::new(false);
     let run = config::parse_section::<RunConfig>("configuration of the model", &model.provenance.config)?;
     let device = parse_device(&run.device)?;
@@ -60,6 +62,23 @@ pub(crate) fn share_per_view(model: &Model, scene: &Arc<Scene>, views: usize, re
             Ok(least)
         };
         let (one, many) = (shortest(1)?, shortest(views)?);
-        Ok(((many - one) / (views.max(2) - 1) as f64 / one.max(1e-9)).clamp(0.0, 1.0))
+        Ok(share(one, many, views))
     })
+}
+
+/// The share where an iteration of one view takes the time `one`, and one of `views` views `many`.
+fn share(one: f64, many: f64, views: usize) -> f64 {
+    if views < 2 { 0.0 } else { ((many - one) / (views - 1) as f64 / one.max(1e-9)).clamp(0.0, 1.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_view_shares_nothing() {
+        assert!((share(10.0, 14.0, 3) - 0.2).abs() < 1e-9 && (share(10.0, 14.0, 2) - 0.4).abs() < 1e-9);
+        // Two measurements of the same differ by chance.
+        assert_eq!(share(10.0, 14.0, 1), 0.0);
+    }
 }

@@ -15,6 +15,8 @@ pub struct Standing {
     pub iteration: usize,
     /// Iterations of the stage.
     pub of: usize,
+    /// Views that the iteration drew: fewer than `train.batch` says where the stage has fewer.
+    pub views: usize,
     /// Frames of the sequence.
     pub frame_count: usize,
 }
@@ -48,11 +50,11 @@ pub trait Observer: Send + Sync {
 }
 
 impl Context<'_> {
-    /// Shows the model to the observer, if there is one and it wants to see it. Nothing of `state` changes.
-    pub(crate) fn observe(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+    /// Shows the model to the observer after an iteration of so many `views`, if there is one and it wants to see it. Nothing of `state` changes.
+    pub(crate) fn observe(&self, state: &mut TrainState, schedule: &Schedule, views: usize) -> Result<()> {
         let Some(observer) = self.job.observer else { return Ok(()) };
         let scene = &self.job.scene;
-        let standing = Standing { stage: schedule.stage, iteration: schedule.iteration, of: schedule.length, frame_count: scene.frame_count };
+        let standing = Standing { stage: schedule.stage, iteration: schedule.iteration, of: schedule.length, views, frame_count: scene.frame_count };
         let times = observer.after_iteration(&standing, self.job.stop);
         if times == 0 {
             return Ok(());

@@ -99,7 +99,7 @@ impl Context<'_> {
                 return Err(failure);
             }
             self.validate(state, &schedule)?;
-            self.observe(state, &schedule)?;
+            self.observe(state, &schedule, batch.len())?;
             if saves {
                 state.record.log = log.record();
                 self.save(state)?;

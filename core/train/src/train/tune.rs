@@ -101,7 +101,8 @@ impl<'a> Tuner<'a> {
             return Ok(known);
         }
         let TuneJob { model, scene, .. } = &self.job;
-        if scene.split(Split::Train).is_empty() {
+        let views = scene.split(Split::Train).len();
+        if views == 0 {
             return Err(Error::parameter("fine-tuning", format!("{} has no training views", scene.name), "Give the scene that the model was trained on"));
         }
         let none = || toml::Table::from_iter([("kind".into(), "none".into())]);
@@ -110,6 +111,8 @@ impl<'a> Tuner<'a> {
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
         (config.density, config.appearance, config.train.image_growth, config.train.sh_every) = (none(), none(), 0.0, 1);
         (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
+        // Learning rates are shares of those of the training, whose iterations drew no more views than there are.
+        config.train.batch = config.train.batch.min(views);
         config.validate()?;
         Ok(self.config.get_or_init(|| config))
     }
@@ -323,5 +326,39 @@ impl TuneModel for Tuner<'_> {
     }
     fn adopted(&self) -> Result<Option<EncodedWeights>> {
         self.adopted.borrow().as_ref().map(|(weights, steps)| self.encoded_weights(weights, *steps)).transpose()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::archive::Provenance;
+    use cc4dgs_core::{Camera, NoImages, Silent, Similarity, View, parse_device};
+    use cc4dgs_play::model::ModelSize;
+    use cc4dgs_play::{Moving, RenderConfig, default_rasterizer};
+
+    #[test]
+    fn learning_rates_follow_the_views_that_training_drew() {
+        let camera = Camera::look_at("a", (8, 8), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let views = (0..3).map(|frame| View { camera: 0, frame, time_norm: 0.0, split: Split::Train }).collect();
+        let scene = Arc::new(Scene::new("s", vec![camera], views, Arc::new(NoImages), 0).unwrap());
+        let (registry, device, limits, stop) = (Registry::collect().unwrap(), parse_device("flex").unwrap(), Limits::default(), AtomicBool::new(false));
+        for (batch, expected) in [(2, 2), (64, 3)] {
+            let model = Model {
+                gaussians: HostGaussians::default(),
+                field: None,
+                moving: Moving::Nothing,
+                render: RenderConfig::default(),
+                background: None,
+                rasterizer: default_rasterizer(),
+                frame_count: 3,
+                normalisation: Similarity::IDENTITY,
+                provenance: Provenance { config: format!("[train]\nbatch = {batch}").parse().unwrap(), ..Default::default() },
+                size: ModelSize::default(),
+            };
+            let (field_weights, scene) = ("fp32", scene.clone());
+            let job = TuneJob { model: &model, scene, field_weights, registry: &registry, device: &device, limits: &limits, events: &Silent, stop: &stop };
+            assert_eq!(Tuner::new(job).config().unwrap().train.batch, expected);
+        }
     }
 }

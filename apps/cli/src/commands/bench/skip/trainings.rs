@@ -96,7 +96,8 @@ impl StepBench<'_> {
         let TrainConfig { batch, sparse_adam, sh_every, image_growth, sh_degree, dynamic, .. } = base.train;
         let unless = |used: bool| (!used).then(|| "the configuration does not use it".to_string());
         let switch = |name, missing, set: &[String]| Switch { name, off: set.to_vec(), missing };
-        let single = ["train.batch=1".to_string(), "train.coarse_batch=0".into(), format!("train.iterations={}", self.iterations * batch)];
+        let views = views_of_iterations(batch, &self.scene);
+        let single = ["train.batch=1".to_string(), "train.coarse_batch=0".into(), format!("train.iterations={}", self.iterations * views)];
         let list = |key: &str| base.deformer.get(key).and_then(toml::Value::as_array);
         let few_heads = list("heads").is_some_and(|heads| heads.len() < HEADS.len());
         let coarse_voxels = list("resolutions").filter(|_| shares);
@@ -112,7 +113,7 @@ impl StepBench<'_> {
             switch("transmittance early out", fixed.map(Into::into), &[format!("rasterizer.{}=false", EARLY_OUTS[1])]),
             switch("sparse Adam", unless(sparse_adam), &["train.sparse_adam=false".into()]),
             switch("higher SH degrees less often", unless(sh_every > 1), &["train.sh_every=1".into()]),
-            switch("several views per spatial pass", unless(batch > 1), &single),
+            switch("several views per spatial pass", unless(views > 1), &single),
             switch("lower resolution early", unless(image_growth > 0.0), &["train.image_growth=0.0".into()]),
             switch("leaving out heads", unless(few_heads), &[format!("deformer.heads={HEADS:?}")]),
             switch("leaving out finer voxels", unless(coarse_voxels.is_some()), &[finer]),
@@ -127,7 +128,7 @@ impl StepBench<'_> {
         let mut ends = Vec::with_capacity(cases.len());
         for round in 0..self.rounds {
             for (index, case) in cases.iter().enumerate() {
-                let clock = Clock::new(&case.config.train);
+                let clock = Clock::default();
                 let (trained, _) = train(&TrainJob {
                     config: &case.config,
                     scene: self.scene.clone(),
@@ -162,17 +163,19 @@ impl StepBench<'_> {
     }
 }
 
+/// The views of an iteration of the main stage: there are no more than `scene` has for training.
+fn views_of_iterations(batch: usize, scene: &Scene) -> usize {
+    batch.min(scene.split(Split::Train).len())
+}
+
 fn bits(gaussians: &HostGaussians) -> u64 {
     let own = gaussians.columns().into_iter().flat_map(|(_, _, values)| values);
     digest(own.chain(gaussians.extra.values().flat_map(|attribute| &attribute.values)))
 }
 
 /// Times the iterations of the coarse and the main stage. The first of each is left out: it comes after what a stage begins with.
-struct Clock {
-    coarse_views: usize,
-    main_views: usize,
-    state: Mutex<ClockState>,
-}
+#[derive(Default)]
+struct Clock(Mutex<ClockState>);
 
 #[derive(Default)]
 struct ClockState {
@@ -182,22 +185,15 @@ struct ClockState {
 }
 
 impl Clock {
-    fn new(train: &TrainConfig) -> Self {
-        Self { coarse_views: train.views_per_iteration(Stage::Coarse), main_views: train.views_per_iteration(Stage::Main), state: Mutex::default() }
-    }
     fn ms_per_view(&self) -> f64 {
-        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         state.seconds * 1e3 / state.views.max(1) as f64
     }
-    fn note(&self, stage: Stage, now: Instant) {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        let views = match stage {
-            Stage::Coarse => self.coarse_views,
-            Stage::Main => self.main_views,
-            // It fits scores, and its iterations cost less.
-            Stage::Score => 0,
-        };
-        if let Some((_, last)) = state.last.filter(|(before, _)| *before == stage && views > 0) {
+    /// Notes an iteration of `stage` that drew so many `views` and ended `now`.
+    fn note(&self, stage: Stage, views: usize, now: Instant) {
+        let mut state = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        // The score stage fits scores, and its iterations cost less.
+        if let Some((_, last)) = state.last.filter(|(before, _)| *before == stage && stage != Stage::Score) {
             state.seconds += now.duration_since(last).as_secs_f64();
             state.views += views;
         }
@@ -207,7 +203,7 @@ impl Clock {
 
 impl Observer for Clock {
     fn after_iteration(&self, standing: &Standing, _: &AtomicBool) -> usize {
-        self.note(standing.stage, Instant::now());
+        self.note(standing.stage, standing.views, Instant::now());
         0
     }
     fn receive(&self, _: Snapshot) {}
@@ -216,17 +212,27 @@ impl Observer for Clock {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::{Camera, NoImages, View};
     use std::time::Duration;
 
     #[test]
     fn the_clock_counts_views_of_iterations_that_follow_one_of_their_stage() {
-        let clock = Clock::new(&TrainConfig { batch: 4, coarse_batch: 1, ..Default::default() });
+        let clock = Clock::default();
         let began = Instant::now();
-        let stages = [Stage::Coarse, Stage::Coarse, Stage::Score, Stage::Score, Stage::Main, Stage::Main, Stage::Main];
-        for (k, stage) in stages.into_iter().enumerate() {
-            clock.note(stage, began + Duration::from_millis(90 * k as u64));
+        let iterations = [(Stage::Coarse, 1), (Stage::Coarse, 1), (Stage::Score, 4), (Stage::Score, 4), (Stage::Main, 4), (Stage::Main, 4), (Stage::Main, 4)];
+        for (k, (stage, views)) in iterations.into_iter().enumerate() {
+            clock.note(stage, views, began + Duration::from_millis(90 * k as u64));
         }
         // One interval of the coarse stage with a view, two of the main stage with four.
         assert!((clock.ms_per_view() - 3.0 * 90.0 / 9.0).abs() < 1e-6, "{}", clock.ms_per_view());
+    }
+
+    #[test]
+    fn iterations_draw_no_more_views_than_the_scene_has() {
+        let camera = Camera::look_at("a", (8, 8), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let view = |frame, split| View { camera: 0, frame, time_norm: 0.0, split };
+        let views = vec![view(0, Split::Train), view(1, Split::Test), view(2, Split::Train), view(3, Split::Train)];
+        let scene = Scene::new("s", vec![camera], views, Arc::new(NoImages), 0).unwrap();
+        assert_eq!([1, 3, 64].map(|batch| views_of_iterations(batch, &scene)), [1, 3, 3]);
     }
 }
