@@ -101,7 +101,7 @@ pub(super) fn figures(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Str
     let mut out = heading("Rate and distortion", note) + &key.legend();
     out += &plots(&rate);
 
-    let note = "Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other. Left is cheaper. Training time is shown with the codec of the highest PSNR.";
+    let note = "Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other; trainings that failed are left out. Left is cheaper. Training time is shown with the codec of the highest PSNR.";
     out += &(heading("Time and size against error", note) + &key.legend());
     out += &plots(&cost);
 
@@ -137,7 +137,8 @@ fn grid(class: &str, figures: String) -> String {
 
 fn point(row: &Row, cost: &Quantity, metric: &Quantity) -> Option<Point> {
     let (x, y) = (row.spread(cost)?, row.spread(metric)?);
-    let hint = format!("{}: {} {}, {} {}", row.name(), x.text(cost.digits), cost.title(), y.text(metric.digits), metric.title());
+    let failed = if row.hopeless() { " (failed)" } else { "" };
+    let hint = format!("{}{failed}: {} {}, {} {}", row.name(), x.text(cost.digits), cost.title(), y.text(metric.digits), metric.title());
     Some(Point { x: x.mean, y: y.mean, y_range: Some((y.low, y.high)), hint })
 }
 
@@ -180,9 +181,9 @@ fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
     }
 }
 
-/// Where the trainings ran on different devices, their times are marked and have no front.
+/// Trainings that failed are no part of the front. Where the trainings ran on different devices, their times are marked and have no front.
 fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key, trained: &TrainingDevices) -> Plot {
-    let means: Vec<(f64, f64)> = rows.iter().filter_map(|row| point(row, cost, metric)).map(|p| (p.x, p.y)).collect();
+    let means: Vec<(f64, f64)> = rows.iter().filter(|row| !row.hopeless()).filter_map(|row| point(row, cost, metric)).map(|p| (p.x, p.y)).collect();
     let mut best: Vec<(f64, f64)> = front(&means, metric.better == Better::Lower).into_iter().map(|i| means[i]).collect();
     let (mut series, mut note) = (points(rows, cost, metric, key), String::new());
     if cost.key == TRAINING.key && trained.differ() {

@@ -146,6 +146,25 @@ fn the_best_of_a_column_is_one_of_several_that_did_not_fail() {
 }
 
 #[test]
+fn trainings_that_failed_are_not_on_the_pareto_front() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    let options = ReportOptions { images: ImageChoice::None, ..Default::default() };
+    let plot = |cells: &[CellResult]| {
+        write(folder.path(), cells);
+        let figures = report(folder.path(), &options).unwrap().figures;
+        figures.into_iter().find(|(name, _)| name == "tiny-psnr-against-size.svg").unwrap().1
+    };
+    let rings = |plot: &str| plot.matches("class=\"onfront\"").count();
+    let sound = plot(&cells);
+    assert_eq!((rings(&sound), sound.contains("(failed)")), (3, false), "all but cdf with cca-default: hexplane with cca-low is smaller and better");
+    // The smallest file, of a training with one seed that failed.
+    cells[2].outcome = Outcome::Hopeless;
+    let failed = plot(&cells);
+    assert_eq!((rings(&failed), failed.contains("cdf / cca-low (failed)")), (2, true), "it is shown without a ring");
+}
+
+#[test]
 fn scores_of_validation_views_are_drawn_where_there_are_some() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());

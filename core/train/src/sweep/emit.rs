@@ -4,6 +4,7 @@ use super::location::variable_of;
 use super::plan::Plan;
 use cc4dgs_core::{Error, Result};
 use std::collections::BTreeMap;
+use std::env::VarError;
 
 /// Exit code of a process that was asked to stop and left a checkpoint.
 pub const INTERRUPTED: u8 = 130;
@@ -109,13 +110,16 @@ fn variables(scheduler: Scheduler, plan: &Plan, stated: &[String]) -> Result<BTr
     }
     for path in plan.trainings.iter().map(|training| &training.data.path) {
         let Some(name) = variable_of(path).filter(|name| !found.contains_key(*name)) else { continue };
-        let problem = match (scheduler, std::env::var(name)) {
-            (Scheduler::Slurm, Ok(value)) if !value.is_empty() => {
+        let value = match scheduler {
+            Scheduler::Slurm => value_here(name, std::env::var(name)),
+            _ => Err(format!("jobs of Kubernetes and SkyPilot do not have the environment variable {name} of this machine")),
+        };
+        let problem = match value {
+            Ok(value) => {
                 found.insert(name.to_string(), value);
                 continue;
             }
-            (Scheduler::Slurm, _) => format!("the environment variable {name} is not set here, so jobs would not get it"),
-            _ => format!("jobs of Kubernetes and SkyPilot do not have the environment variable {name} of this machine"),
+            Err(problem) => problem,
         };
         let remedy = format!("Give --env {name}=DIR, the folder that the path starts from as the jobs see it");
         return Err(Error::parameter(format!("scene {path}"), problem, remedy));
@@ -126,6 +130,15 @@ fn variables(scheduler: Scheduler, plan: &Plan, stated: &[String]) -> Result<BTr
         return Err(Error::parameter(format!("variable '{name}'"), problem, "Use another name"));
     }
     Ok(found)
+}
+
+/// The value of the environment variable `name`, which was `found` on this machine, for jobs; or why they cannot have it.
+fn value_here(name: &str, found: std::result::Result<String, VarError>) -> std::result::Result<String, String> {
+    match found {
+        Ok(value) if !value.is_empty() => Ok(value),
+        Err(VarError::NotUnicode(value)) => Err(format!("the environment variable {name} is not Unicode here ({value:?}), and job files are")),
+        _ => Err(format!("the environment variable {name} is not set here, so jobs would not get it")),
+    }
 }
 
 /// `text` as one word of a shell.

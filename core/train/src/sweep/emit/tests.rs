@@ -225,9 +225,19 @@ fn variables_reach_the_jobs() {
     assert!(emitted(Scheduler::Slurm, "$PATH/mutant", &["PATH=/there"]).unwrap().contains("\nexport PATH='/there'\n"));
     let message = refused(Scheduler::Slurm, "$CC4DGS_NO_SUCH_VARIABLE/mutant", &[]);
     assert!(message.contains("CC4DGS_NO_SUCH_VARIABLE is not set here"), "{message}");
+    assert_eq!(value_here("A", Ok("/data".into())), Ok("/data".into()));
+    assert!([Ok(String::new()), Err(VarError::NotPresent)].into_iter().all(|found| value_here("A", found).unwrap_err().contains("A is not set here")));
     for wrong in [&["A"][..], &["A="], &["1A=x"], &["A B=x"], &["=x"], &["INDEX=3"], &["A=x", "A=y"], &["A=x\ny"]] {
         assert!(emitted(Scheduler::SkyPilot, "procedural:tiny", wrong).is_err(), "{wrong:?}");
     }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_variable_that_is_not_unicode_is_not_called_absent() {
+    let value: std::ffi::OsString = std::os::unix::ffi::OsStringExt::from_vec(b"/d\xe9part".to_vec());
+    let message = value_here("CC4DGS_DATA", Err(VarError::NotUnicode(value))).unwrap_err();
+    assert!(message.contains("CC4DGS_DATA is not Unicode here") && message.contains("part") && !message.contains("not set"), "{message}");
 }
 
 /// The script as bash reads it, with a program that answers with its arguments, a variable and an exit code.
