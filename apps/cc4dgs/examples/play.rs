@@ -28,7 +28,7 @@ fn main() -> Result<()> {
 
     if video::ffmpeg_version().is_ok() {
         let file = folder.join("orbit.mp4");
-        video::encode(&folder, frames, 12, &file)?;
+        video::encode(&folder, frames, 12.0, &file)?;
         println!("video {}", file.display());
     }
     Ok(())

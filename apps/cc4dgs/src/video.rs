@@ -2,8 +2,12 @@
 
 use cc4dgs_core::{Error, Image8, Result};
 use std::io::Write;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+
+/// Images per second that a video may have.
+pub const RATES: RangeInclusive<f64> = 0.01..=1000.0;
 
 const REMEDY: &str = "Install ffmpeg (Debian: apt install ffmpeg), or render PNG frames without a video";
 
@@ -34,14 +38,23 @@ fn pattern(frames: &Path) -> PathBuf {
 /// Makes the video `out` of the first `count` images in `frames`, named by [`frame_name`], at `fps` images per second; it appears complete or not at all.
 ///
 /// # Errors
-/// [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] with its last message where it fails, [`Error::Io`] for a folder that cannot be written.
-pub fn encode(frames: &Path, count: usize, fps: u32, out: &Path) -> Result<()> {
-    let part = temporary(out)?;
+/// [`Error::Parameter`] for a rate outside [`RATES`], [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] with its last message where it fails,
+/// [`Error::Io`] for a folder that cannot be written.
+pub fn encode(frames: &Path, count: usize, fps: f64, out: &Path) -> Result<()> {
+    let (rate, part) = (rate(fps)?, temporary(out)?);
     let mut command = ffmpeg();
-    command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i"]).arg(pattern(frames)).args(["-frames:v", &count.to_string()]);
+    command.args(["-framerate", &rate, "-start_number", "0", "-i"]).arg(pattern(frames)).args(["-frames:v", &count.to_string()]);
     let output = command.args(CODEC).arg(&part).stdin(Stdio::null()).output().map_err(absent)?;
     check(&output)?;
     part.persist(out).map_err(|e| Error::io(out, e.error))
+}
+
+/// `fps` as ffmpeg reads it, exactly: rates such as 29.97 are no whole numbers.
+fn rate(fps: f64) -> Result<String> {
+    if RATES.contains(&fps) {
+        return Ok(fps.to_string());
+    }
+    Err(Error::parameter("video", format!("{fps} images per second"), format!("Give {} to {}", RATES.start(), RATES.end())))
 }
 
 /// Encoding that players agree on: 4:2:0 colour, which needs even sides, by the matrix of BT.709 whatever the size, and the index in front. Nothing of the day or
@@ -70,7 +83,7 @@ const CODEC: [&str; 18] = [
 /// A video that is fed image by image; no image is stored. It appears once it is finished.
 pub struct VideoWriter {
     out: PathBuf,
-    fps: u32,
+    fps: f64,
     crf: Option<u32>,
     running: Option<Running>,
 }
@@ -90,8 +103,8 @@ impl Drop for Running {
 }
 
 impl VideoWriter {
-    /// The video `out` with `fps` images per second. Nothing is started before the first image.
-    pub fn new(out: impl Into<PathBuf>, fps: u32) -> Self {
+    /// The video `out` with `fps` images per second, one of [`RATES`]. Nothing is started before the first image.
+    pub fn new(out: impl Into<PathBuf>, fps: f64) -> Self {
         Self { out: out.into(), fps, crf: None, running: None }
     }
     /// The same with the quality `crf` of x264: 0 is lossless, 51 the worst; ffmpeg's default is 23.
@@ -101,7 +114,8 @@ impl VideoWriter {
     /// Appends an RGB image; all have the size of the first.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] where it fails, [`Error::Data`] for an image of another size or with alpha.
+    /// [`Error::Parameter`] for a rate outside [`RATES`], [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] where it fails, [`Error::Data`] for an
+    /// image of another size or with alpha.
     pub fn add(&mut self, image: &Image8) -> Result<()> {
         image.validate("image of a video")?;
         let size = (image.width, image.height);
@@ -135,10 +149,10 @@ impl VideoWriter {
         running.part.take().map_or(Ok(()), |part| part.persist(&self.out)).map_err(|e| Error::io(&self.out, e.error))
     }
     fn start(&self, (width, height): (u32, u32)) -> Result<Running> {
-        let part = temporary(&self.out)?;
+        let (rate, part) = (rate(self.fps)?, temporary(&self.out)?);
         let mut command = ffmpeg();
         command.args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &format!("{width}x{height}")]);
-        command.args(["-framerate", &self.fps.to_string(), "-i", "-"]).args(CODEC);
+        command.args(["-framerate", &rate, "-i", "-"]).args(CODEC);
         if let Some(crf) = self.crf {
             command.args(["-crf", &crf.to_string()]);
         }
@@ -211,6 +225,18 @@ mod tests {
     }
 
     #[test]
+    fn rates_are_handed_on_exactly() {
+        for (fps, text) in [(30.0, "30"), (29.97, "29.97"), (23.976, "23.976"), (0.5, "0.5"), (1000.0, "1000")] {
+            assert_eq!(rate(fps).unwrap(), text);
+        }
+        for fps in [0.0, -1.0, 1e4, f64::NAN, f64::INFINITY] {
+            let image = Image8 { width: 2, height: 2, channels: 3, data: vec![0; 12] };
+            let message = VideoWriter::new("a.mp4", fps).add(&image).unwrap_err().to_string();
+            assert!(message.contains(&format!("{fps} images per second")) && message.contains("0.01 to 1000"), "{message}");
+        }
+    }
+
+    #[test]
     fn frames_of_any_folder_become_a_video() {
         if ffmpeg_version().is_err() {
             eprintln!("ffmpeg is absent: skipped");
@@ -220,7 +246,7 @@ mod tests {
         let (frames, out) = (root.path().join("100%d"), root.path().join("a.mp4"));
         let image = Image8 { width: 16, height: 16, channels: 3, data: vec![128; 16 * 16 * 3] };
         (0..2).for_each(|index| cc4dgs_train::images::write_png(frames.join(frame_name(index)), &image).unwrap());
-        encode(&frames, 2, 5, &out).unwrap();
+        encode(&frames, 2, 5.0, &out).unwrap();
         assert!(out.metadata().unwrap().len() > 100);
     }
 }

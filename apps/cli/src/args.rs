@@ -14,6 +14,7 @@ pub use play::{VIEW_DEVICE, VIEW_MAX_ERROR};
 pub use prune::Prune;
 pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRun, SweepWhat};
 
+use cc4dgs::video::RATES;
 use cc4dgs_play::OrbitViews;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -71,7 +72,7 @@ pub enum Command {
     Plugins(Plugins),
     /// Check this machine: processor, threads, devices, adapters, ffmpeg, the page of the player, the weights of LPIPS, and an image drawn on each device.
     Doctor(Doctor),
-    /// Try float32 against float64 under conditions that break floating point. Ends with 5 where a result is neither finite nor an error, and where an ordinary
+    /// Compare float32 with float64 under conditions that break floating point. Exit code 5 where a result is neither finite nor an error, and where an ordinary
     /// condition ends with an error.
     Stress(Stress),
     /// Run a grid of scenes, methods, settings, codecs and seeds, and make its tables.
@@ -104,7 +105,7 @@ pub struct Train {
     /// Settings to start from: a family, such as dnerf, or a family with another deformer, such as auto+hexplane; `cc4dgs plugins` lists both. Without one and without --config, `auto` chooses them by looking at the scene.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
-    /// Wall time that the preset `auto` plans for; ten on processors, five on a graphics card by default.
+    /// Wall time in minutes that the preset `auto` plans for; by default ten on processors and five on a graphics card.
     #[arg(long, value_name = "M")]
     pub minutes: Option<f64>,
     /// A TOML file laid over the preset.
@@ -131,19 +132,23 @@ pub struct Train {
     pub view: bool,
 }
 
+/// What `compress` takes without `--codec` and `--field-weights`: what the paper does, and weights as they are.
+pub const COMPRESS_CODEC: &str = "cca:default";
+pub const COMPRESS_WEIGHTS: &str = "fp32";
+
 #[derive(Debug, Args)]
 pub struct Compress {
     /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
-    /// Codec, with its profile after a colon, such as compact:max-drop=0.05dB or compact:max-size=5MB.
-    #[arg(long, value_name = "NAME[:PROFILE]", default_value = "cca:default")]
+    /// Codec, with its profile after a colon. With --scene, compact:max-drop=0.05dB or compact:max-size=5MB makes the smallest files.
+    #[arg(long, value_name = "NAME[:PROFILE]", default_value = COMPRESS_CODEC)]
     pub codec: String,
     /// Override a setting of the codec (finetune=0), or with --scene a scene option (scene.width=800); may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
     /// Weight codec of the deformer, such as fp32, fp16, int8, compact, compact:bits=6 or compact:max-drop=0.01dB; see `cc4dgs plugins`.
-    #[arg(long, value_name = "NAME[:SETTING]", default_value = "fp32")]
+    #[arg(long, value_name = "NAME[:SETTING]", default_value = COMPRESS_WEIGHTS)]
     pub field_weights: String,
     /// The dataset that the model was trained on, for codecs that make use of its views; validation views, else training views, judge what is lost.
     #[arg(long, value_name = "PATH")]
@@ -172,7 +177,7 @@ pub struct ModelViews {
     /// The dataset, or `procedural`.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Which side of its split.
+    /// Which of its images.
     #[arg(long, value_enum, default_value_t = SplitArg::Test)]
     pub split: SplitArg,
     /// Scene options over those the model was trained with, such as scene.width=800 (0 is the images' own size, the largest); may be given several times.
@@ -268,7 +273,7 @@ pub struct Stress {
     /// Device to test: auto, flex, ndarray, wgpu, cuda.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
-    /// A million optimizer steps (twenty thousand or fewer otherwise), and all times of each deformer.
+    /// Take a million optimizer steps (otherwise twenty thousand or fewer), and test each deformer at all times.
     #[arg(long)]
     pub full: bool,
 }
@@ -336,6 +341,12 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
     }
 }
 
+/// Reads a number of images per second.
+fn parse_rate(text: &str) -> Result<f64, String> {
+    let rate = text.parse().ok().filter(|rate| RATES.contains(rate));
+    rate.ok_or_else(|| format!("write a number from {} to {}, such as 29.97", RATES.start(), RATES.end()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -363,6 +374,16 @@ mod tests {
         assert_eq!(parse_size("800x600"), Ok((800, 600)));
         for bad in ["800", "0x5", "5x", "-1x4", "99999x4", "4x4x4"] {
             assert!(parse_size(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn rates_of_videos_need_not_be_whole() {
+        for (text, rate) in [("30", 30.0), ("29.97", 29.97), ("0.5", 0.5)] {
+            assert_eq!(parse_rate(text), Ok(rate));
+        }
+        for bad in ["0", "-3", "1001", "NaN", "fast"] {
+            assert!(parse_rate(bad).unwrap_err().contains("0.01 to 1000"), "{bad}");
         }
     }
 }

@@ -149,10 +149,18 @@ impl Navigator {
             world_to_camera: [row(right), row(down), row(self.forward()), [0.0, 0.0, 0.0, 1.0]],
         }
     }
-    /// Eye, target and vertical angle, for links.
+    /// Eye, target and vertical angle in radians, for links.
     pub fn pose(&self) -> [f64; 7] {
         let (e, t) = (self.eye, self.target);
         [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y]
+    }
+    /// `pose` as links and commands have it: seven numbers with commas between. Positions are right to a millionth of the distance between eye and target,
+    /// however far from the origin they are.
+    pub fn pose_text(pose: [f64; 7]) -> String {
+        let distance = (0..3).map(|axis| (pose[axis] - pose[axis + 3]).powi(2)).sum::<f64>().sqrt();
+        let decimals = (6.0 - distance.log10().floor()).clamp(0.0, 17.0) as usize;
+        let text: Vec<String> = pose.iter().enumerate().map(|(k, &v)| rounded(v, if k < 6 { decimals } else { 7 })).collect();
+        text.join(",")
     }
     /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored. Returns whether it was taken.
     pub fn set_pose(&mut self, pose: [f64; 7]) -> bool {
@@ -163,6 +171,13 @@ impl Navigator {
         }
         sees
     }
+}
+
+/// `value` with at most so many decimals, and no zeros at their end.
+fn rounded(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    let short = if decimals > 0 { text.trim_end_matches('0').trim_end_matches('.') } else { text.as_str() };
+    if short == "-0" { "0".into() } else { short.into() }
 }
 
 #[cfg(test)]
@@ -254,6 +269,26 @@ mod tests {
         assert!(navigator.set_pose(near));
         (0..100).for_each(|_| navigator.zoom(1.0 / 1.2));
         assert!((navigator.forward() - forward).length() < 1e-6 && (navigator.eye - navigator.target).length() > distance, "{:?}", navigator.pose());
+    }
+
+    #[test]
+    fn the_text_of_a_pose_leads_back_to_the_same_view() {
+        // Beside the origin, in UTM coordinates, near a point, and in a scene as large as a city.
+        let utm = [500_012.345_678_9, 5_200_034.567_891_2, 431.25, 500_009.1, 5_200_030.2, 429.875, 0.9];
+        let near = [0.2, 0.1, 0.300_001_234_567, 0.2, 0.1, 0.3, 0.012_345_678];
+        let city = [-12_345.678_9, 1e-9, 0.0, 54_321.0, -1e-9, 250.0, 3.0];
+        for pose in [[1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, 1e-7, 0.927_295_218], utm, near, city] {
+            let text = Navigator::pose_text(pose);
+            let read: Vec<f64> = text.split(',').map(|v| v.parse().unwrap()).collect();
+            let read: [f64; 7] = read.try_into().unwrap();
+            let [eye, target] = [0, 3].map(|k| DVec3::new(read[k] - pose[k], read[k + 1] - pose[k + 1], read[k + 2] - pose[k + 2]).length());
+            let distance = DVec3::new(pose[0] - pose[3], pose[1] - pose[4], pose[2] - pose[5]).length();
+            assert!(eye.max(target) <= 1e-6 * distance && (read[6] - pose[6]).abs() <= 1e-7, "{text}: {eye} and {target} off, at a distance of {distance}");
+            assert!(Navigator::new(&Presentation::default(), [-1.0; 3], [1.0; 3]).set_pose(read), "{text}");
+            assert_eq!(Navigator::pose_text(read), text, "a link of a link is another");
+        }
+        assert_eq!(Navigator::pose_text([1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, -1e-7, 0.927_295_218]), "1,-2.5,0.333333,0,0,0,0.9272952");
+        assert_eq!(Navigator::pose_text([1000.0, 0.0, 2e7, -300.0, -0.4, 0.0, 0.9]), "1000,0,20000000,-300,0,0,0.9");
     }
 
     #[test]

@@ -386,8 +386,7 @@ class Page {
         const url = new URL(location.href);
         // A file that was dropped has no address.
         if (typeof this.source === "string") url.searchParams.set("src", this.source); else if (this.source) url.searchParams.delete("src");
-        const digits = v => Number(v.toPrecision(6));
-        if (this.gpu) url.hash = `t=${digits(this.time)}&pose=${Array.from(this.gpu.pose, digits).join(",")}`;
+        if (this.gpu) url.hash = `t=${Number(this.time.toPrecision(6))}&pose=${this.gpu.poseText}`;
         return url.href;
     }
     followLink() {

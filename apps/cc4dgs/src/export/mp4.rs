@@ -22,7 +22,7 @@ impl Exporter for Mp4 {
         if facts.images == 0 {
             return Err(Error::parameter("mp4", "there are no cameras to render from", "Give cameras, such as those of an orbit or of --scene"));
         }
-        let mut video = VideoWriter::new(path, facts.frames_per_second.round().max(1.0) as u32).quality(self.crf);
+        let mut video = VideoWriter::new(path, facts.frames_per_second).quality(self.crf);
         for index in 0..facts.images {
             video.add(&source.image(index)?)?;
             source.progress(index + 1, facts.images)?;

@@ -1,6 +1,6 @@
 //! Arguments of `decompress`, `render` and `export`: models in the formats of other programs.
 
-use super::{SplitArg, UpArg, parse_size};
+use super::{SplitArg, UpArg, parse_rate, parse_size};
 use clap::Args;
 use std::path::PathBuf;
 
@@ -72,15 +72,15 @@ pub struct Shots {
     /// The axis of the world that points up, for the orbit and for gltf.
     #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
     pub up: UpArg,
-    /// Frames per second of a video, and of a page where the model states none [default: 30].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=240))]
-    pub fps: Option<u32>,
+    /// Frames per second of a video, such as 29.97, and of a page where the model states none [default: 30].
+    #[arg(long, value_name = "N", value_parser = parse_rate)]
+    pub fps: Option<f64>,
 }
 
 impl Shots {
     /// Frames per second.
-    pub fn rate(&self) -> u32 {
-        self.fps.unwrap_or(30)
+    pub fn rate(&self) -> f64 {
+        self.fps.unwrap_or(30.0)
     }
 }
 

@@ -34,7 +34,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     let request = ExportRequest {
         time_norm: args.time,
         frames: args.shots.frames.map(|n| n as usize),
-        frames_per_second: f64::from(args.shots.rate()),
+        frames_per_second: args.shots.rate(),
         up: args.shots.up.into(),
         shots,
         background,

@@ -157,17 +157,18 @@ fn videos_have_their_images() {
     let at = |name: &str| folder.path().join(name);
     train(&at("run"), "cdf-basis", 0);
     let (dir, video, captured) = (at("run"), at("orbit.mp4"), at("captured.mp4"));
-    let size = ["--frames", "5", "--size", "50x39", "--fps", "5", "--device", "flex", "-q"];
+    let size = ["--frames", "5", "--size", "50x39", "--fps", "29.97", "--device", "flex", "-q"];
     succeed(&[&["export", "mp4", text(&dir), "--out", text(&video)], &size[..]].concat());
     succeed(&["export", "mp4", text(&dir), "--out", text(&captured), "--scene", "procedural:tiny", "--frames", "3", "--device", "flex", "-q"]);
     let frames = at("frames");
     let both = at("both.mp4");
     succeed(&[&["render", text(&dir), "--out", text(&frames), "--mp4", text(&both)], &size[..]].concat());
-    for (file, count, width) in [(&video, 5, Some(50)), (&captured, 3, None), (&both, 5, Some(50))] {
+    for (file, count, width, rate) in [(&video, 5, Some(50), "2997/100"), (&captured, 3, None, "30/1"), (&both, 5, Some(50), "2997/100")] {
         let probe = Command::new("ffprobe").args(["-v", "error", "-count_frames", "-show_streams", "-of", "json"]).arg(file).output().unwrap();
         let probe: Value = serde_json::from_slice(&probe.stdout).unwrap();
         let stream = &probe["streams"][0];
         assert_eq!((&stream["codec_name"], &stream["nb_read_frames"]), (&Value::from("h264"), &Value::from(count.to_string())), "{probe}");
+        assert_eq!(stream["avg_frame_rate"], rate, "{probe}");
         assert!(width.is_none_or(|width| stream["width"] == width && stream["height"] == 40), "{probe}");
     }
     assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 6, "five frames and the mark of the folder");

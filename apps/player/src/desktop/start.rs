@@ -38,18 +38,13 @@ impl Start {
     pub fn command(&self, program: &str, file: &Path) -> String {
         let mut out = format!("{program} {}", quoted(&file.to_string_lossy()));
         if let Some(time) = self.time {
-            out += &format!(" --time {}", digits(f64::from(time)));
+            out += &format!(" --time {time}");
         }
         if let Some(pose) = self.pose {
-            out += &format!(" --pose={}", pose.map(|v| digits(v).to_string()).join(","));
+            out += &format!(" --pose={}", Navigator::pose_text(pose));
         }
         out
     }
-}
-
-/// `value` with six significant digits.
-fn digits(value: f64) -> f64 {
-    format!("{value:.5e}").parse().unwrap_or(value)
 }
 
 fn quoted(text: &str) -> String {
@@ -63,10 +58,10 @@ mod tests {
 
     #[test]
     fn a_command_says_where_it_begins() {
-        let pose = [1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, 1e-7, 0.9];
+        let pose = [500_001.0, 5_200_000.0 - 2.5, 1.0 / 3.0, 5e5, 5.2e6, 1e-7, 0.9];
         let start = Start { time: Some(0.37), pose: Some(pose) };
         let command = start.command("cc4dgs view", Path::new("it's here/a.cc4d"));
-        assert_eq!(command, r"cc4dgs view 'it'\''s here/a.cc4d' --time 0.37 --pose=1,-2.5,0.333333,0,0,0.0000001,0.9");
+        assert_eq!(command, r"cc4dgs view 'it'\''s here/a.cc4d' --time 0.37 --pose=500001,5199997.5,0.333333,500000,5200000,0,0.9");
         let read = Start::parse_pose(command.split_once("--pose=").unwrap().1).unwrap();
         assert!(read.iter().zip(pose).all(|(a, b)| (a - b).abs() < 1e-6), "{read:?}");
         assert_eq!(Start::default().command("cc4dgs view", Path::new("runs/mutant")), "cc4dgs view runs/mutant");

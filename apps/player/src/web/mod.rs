@@ -340,6 +340,11 @@ impl Player {
     pub fn pose(&self) -> Vec<f64> {
         self.navigator.pose().to_vec()
     }
+    /// The pose as links have it.
+    #[wasm_bindgen(getter, js_name = poseText)]
+    pub fn pose_text(&self) -> String {
+        Navigator::pose_text(self.navigator.pose())
+    }
     /// Takes a pose of the getter.
     #[wasm_bindgen(setter)]
     pub fn set_pose(&mut self, pose: Vec<f64>) {
