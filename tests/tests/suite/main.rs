@@ -10,6 +10,7 @@ mod cdf;
 mod checkpoints;
 mod checks;
 mod codec_context;
+mod codec_services;
 mod codecs;
 mod colors;
 mod columns;
