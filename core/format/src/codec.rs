@@ -43,9 +43,15 @@ pub trait AttributeCodec: Send + Sync {
     /// Encodes all attributes. Deterministic: equal Gaussians, settings and `context` give equal bytes, whatever the number of threads.
     ///
     /// Of [`HostGaussians::extra`], the needed rows must be kept, bit for bit or within each attribute's tolerance.
+    ///
+    /// # Errors
+    /// [`Error::Data`](crate::Error::Data) for Gaussians that are not finite or whose columns differ in length, as [`HostGaussians::validate`] returns it.
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>>;
     /// Decodes what [`AttributeCodec::encode`] wrote; streams are found by name and may be in any order. Bytes are untrusted: an error, never a panic. A stream
     /// that ends early or has bytes behind its end is an error. `context` has no views, renderer and deformer.
+    ///
+    /// # Errors
+    /// [`Error::Data`](crate::Error::Data) for damaged streams, [`Error::Limit`](crate::Error::Limit) for counts over [`CodecContext::limits`].
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>;
     /// When a player needs the stream `name`.
     fn stage(&self, _name: &str) -> StreamStage {

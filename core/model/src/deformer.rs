@@ -133,7 +133,7 @@ impl SpatialInput {
 }
 
 /// A number or vector per Gaussian that a deformer learns in addition to its weights. It is one of the Gaussians' extra attributes: density control copies and
-/// removes it with its Gaussian, and checkpoints and archives store it by name. A Gaussian that key frames or recovery add has that of the nearest one that moves.
+/// removes it with its Gaussian, and checkpoints and archives store it by name. Gaussians that key frames or recovery add take the value of the nearest moving one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AttributeSpec {
     /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and not one of the attributes that every Gaussian has.
@@ -216,12 +216,18 @@ pub fn check_parameters(owner: &str, parameters: &[&Parameter], groups: &[Parame
 /// The time-invariant half is a separate call, so that playback can cache it. Training recomputes it every step.
 pub trait Deformer: Send {
     /// Features of M Gaussians, from their centres and the attributes of [`Deformer::attributes`].
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for Gaussians without these attributes, as [`SpatialInput::check`] returns it.
     fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures>;
     /// The deformer's attributes per Gaussian; [`Deformer::spatial`] receives their values.
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
     }
-    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` `[M,F]`; the same heads at every time.
+    /// Offsets at `time_norm` (0 at the first frame, 1 at the last) for the M Gaussians of `features` `[M,F]`; the same heads at every time.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for a time that is not finite.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
     /// The offsets of [`Deformer::deform`] at each of `times_norm`. Training asks for all views of an iteration at once, so that work and gradients can be shared.
     fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
@@ -245,8 +251,8 @@ pub trait Deformer: Send {
     fn is_static(&self) -> bool {
         false
     }
-    /// An additional loss term `[1]` for the moving Gaussians, once per iteration, at `time_norm` (0..1), the time of its first view; `progress` (0..1) is that of the
-    /// main stage.
+    /// An additional loss term `[1]` for the moving Gaussians, added as it is. It is asked for once per iteration, with the time `time_norm` (0..1) of the first view
+    /// of that iteration and the `progress` (0..1) of the main stage.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }

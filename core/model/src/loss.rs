@@ -15,7 +15,7 @@ pub struct LossInput<'a> {
     pub gaussians: &'a Gaussians,
     /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
     pub radii: &'a Tensor<1, burn::tensor::Int>,
-    /// Normalised time of the view.
+    /// Normalised time of the view, 0..1.
     pub time_norm: f32,
     /// The current iteration of training.
     pub schedule: &'a Schedule,
@@ -23,7 +23,7 @@ pub struct LossInput<'a> {
 
 /// One term of the loss.
 pub trait LossTerm: Send {
-    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape ends the training with an error.
+    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
 }
 

@@ -88,7 +88,7 @@ pub struct RenderSettings {
     pub focal: Option<f64>,
     /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
     pub near: Option<f32>,
-    /// Colour behind everything, linear RGB in 0..1 `[3]`; may carry a gradient. `None` is black.
+    /// Colour behind everything, RGB in 0..1 as in images `[3]`; may carry a gradient. `None` is black.
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
@@ -157,6 +157,10 @@ pub struct RenderWork {
 pub trait Rasterizer: Send + Sync {
     /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients, the probes included,
     /// receives one in the backward pass. A probe must not change the planes or other gradients.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for shapes and settings that do not fit, [`Error::Limit`] for sizes that the device cannot hold, [`Error::Unsupported`] for a device
+    /// without this rasterizer.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
     /// Planes `[3,H,W]` in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
     fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
@@ -164,6 +168,9 @@ pub trait Rasterizer: Send + Sync {
         Tensor::from_data(TensorData::new(image.to_planes(background), shape), device)
     }
     /// The 8-bit RGB image of planes `[C,H,W]` of which the first three are red, green and blue; the same rule as [`Image8::from_planes`].
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for fewer than three planes and for planes without a pixel, [`Error::Backend`] if the device fails.
     fn download(&self, planes: Tensor<3>) -> Result<Image8> {
         let [channels, height, width] = planes.dims();
         if channels < 3 || height == 0 || width == 0 {
