@@ -149,25 +149,30 @@ impl Navigator {
             world_to_camera: [row(right), row(down), row(self.forward()), [0.0, 0.0, 0.0, 1.0]],
         }
     }
-    /// Eye, target and vertical angle in radians, for links.
-    pub fn pose(&self) -> [f64; 7] {
+    /// Eye, target, vertical angle and roll, angles in radians, for links.
+    pub fn pose(&self) -> [f64; 8] {
         let (e, t) = (self.eye, self.target);
-        [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y]
+        [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y, self.roll]
     }
-    /// `pose` as links and commands have it: seven numbers with commas between. Positions are right to a millionth of the distance between eye and target,
-    /// however far from the origin they are.
-    pub fn pose_text(pose: [f64; 7]) -> String {
+    /// The pose of seven or eight numbers, `None` for another number of them. Without the eighth there is no roll.
+    pub fn pose_of(numbers: &[f64]) -> Option<[f64; 8]> {
+        (7..=8).contains(&numbers.len()).then(|| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(0.0)))
+    }
+    /// `pose` as links and commands have it: numbers with commas between, eight where there is a roll, else seven. Positions are right to a millionth of the
+    /// distance between eye and target, however far from the origin they are.
+    pub fn pose_text(pose: [f64; 8]) -> String {
         let distance = (0..3).map(|axis| (pose[axis] - pose[axis + 3]).powi(2)).sum::<f64>().sqrt();
         let decimals = (6.0 - distance.log10().floor()).clamp(0.0, 17.0) as usize;
         let text: Vec<String> = pose.iter().enumerate().map(|(k, &v)| rounded(v, if k < 6 { decimals } else { 7 })).collect();
-        text.join(",")
+        let shown = if text[7] == "0" { 7 } else { 8 };
+        text[..shown].join(",")
     }
     /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored. Returns whether it was taken.
-    pub fn set_pose(&mut self, pose: [f64; 7]) -> bool {
+    pub fn set_pose(&mut self, pose: [f64; 8]) -> bool {
         let (eye, target) = (DVec3::new(pose[0], pose[1], pose[2]), DVec3::new(pose[3], pose[4], pose[5]));
         let sees = pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && (0.01..3.1).contains(&pose[6]);
         if sees {
-            (self.eye, self.target, self.fov_y, self.roll) = (eye, target, pose[6], 0.0);
+            (self.eye, self.target, self.fov_y, self.roll) = (eye, target, pose[6], pose[7]);
         }
         sees
     }
@@ -277,18 +282,29 @@ mod tests {
         let utm = [500_012.345_678_9, 5_200_034.567_891_2, 431.25, 500_009.1, 5_200_030.2, 429.875, 0.9];
         let near = [0.2, 0.1, 0.300_001_234_567, 0.2, 0.1, 0.3, 0.012_345_678];
         let city = [-12_345.678_9, 1e-9, 0.0, 54_321.0, -1e-9, 250.0, 3.0];
+        let read = |text: &str| Navigator::pose_of(&text.split(',').map(|v| v.parse().unwrap()).collect::<Vec<f64>>()).unwrap();
         for pose in [[1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, 1e-7, 0.927_295_218], utm, near, city] {
-            let text = Navigator::pose_text(pose);
-            let read: Vec<f64> = text.split(',').map(|v| v.parse().unwrap()).collect();
-            let read: [f64; 7] = read.try_into().unwrap();
+            let text = Navigator::pose_text(Navigator::pose_of(&pose).unwrap());
+            let read = read(&text);
             let [eye, target] = [0, 3].map(|k| DVec3::new(read[k] - pose[k], read[k + 1] - pose[k + 1], read[k + 2] - pose[k + 2]).length());
             let distance = DVec3::new(pose[0] - pose[3], pose[1] - pose[4], pose[2] - pose[5]).length();
             assert!(eye.max(target) <= 1e-6 * distance && (read[6] - pose[6]).abs() <= 1e-7, "{text}: {eye} and {target} off, at a distance of {distance}");
             assert!(Navigator::new(&Presentation::default(), [-1.0; 3], [1.0; 3]).set_pose(read), "{text}");
             assert_eq!(Navigator::pose_text(read), text, "a link of a link is another");
         }
-        assert_eq!(Navigator::pose_text([1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, -1e-7, 0.927_295_218]), "1,-2.5,0.333333,0,0,0,0.9272952");
-        assert_eq!(Navigator::pose_text([1000.0, 0.0, 2e7, -300.0, -0.4, 0.0, 0.9]), "1000,0,20000000,-300,0,0,0.9");
+        assert_eq!(Navigator::pose_text([1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, -1e-7, 0.927_295_218, 1e-9]), "1,-2.5,0.333333,0,0,0,0.9272952");
+        assert_eq!(Navigator::pose_text([1000.0, 0.0, 2e7, -300.0, -0.4, 0.0, 0.9, -0.25]), "1000,0,20000000,-300,0,0,0.9,-0.25");
+        assert!(Navigator::pose_of(&[1.0; 6]).is_none() && Navigator::pose_of(&[1.0; 9]).is_none());
+        // A captured camera that was held at an angle stays so.
+        let rolled = Camera::look_at("rolled", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.3, 0.1, 1.0]);
+        let shown = Presentation { home: Some(rolled), up: Some([0.0, 0.0, 1.0]), ..Default::default() };
+        let start = Navigator::new(&shown, [-1.0; 3], [1.0; 3]);
+        let mut linked = start.clone();
+        linked.orbit(0.3, 0.2);
+        assert!(linked.set_pose(read(&Navigator::pose_text(start.pose()))));
+        let (wanted, found) = (start.camera(640, 480).world_to_camera, linked.camera(640, 480).world_to_camera);
+        let far = wanted.iter().flatten().zip(found.iter().flatten()).fold(0.0f64, |worst, (a, b)| worst.max((a - b).abs()));
+        assert!(far < 1e-4, "the link turns the view by {far}");
     }
 
     #[test]
@@ -303,7 +319,7 @@ mod tests {
             navigator.camera(10, 10).validate().unwrap();
         }
         let pose = navigator.pose();
-        assert!(!navigator.set_pose([f64::NAN; 7]));
+        assert!(!navigator.set_pose([f64::NAN; 8]));
         assert_eq!(navigator.pose(), pose);
         assert!(navigator.set_pose(pose));
         navigator.zoom(f64::NAN);

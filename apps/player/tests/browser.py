@@ -6,7 +6,7 @@ opened from disk, without a network. Chromium renders with SwiftShader, so no gr
 the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
-from browser_faults import broken_module, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
+from browser_faults import broken_module, fetched_meanwhile, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
 from browser_gaussian import one_gaussian, remarks
 from browser_input import command_key, drop, embedded, focus, held, reduced_motion, touch, wheel
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
@@ -131,6 +131,7 @@ def main():
         one_gaussian(pages)
         remarks(pages)
         opened_meanwhile(pages)
+        fetched_meanwhile(pages)
         second_player(pages)
         destroyed(pages, facts)
         hopeless(pages)
@@ -336,15 +337,17 @@ def degrees(pages, page):
 
 def errors(pages, page):
     """Damage is a sentence."""
-    for name in ("damaged", "hostile", "cut", "text", "vast", "missing"):
+    for name, said in {"damaged": "", "hostile": "", "cut": "", "text": "", "vast": "", "missing": "404", "empty": "is empty"}.items():
         message = page.evaluate(f"cc4dgs.load('/{name}.cc4d').then(() => 'it loaded', e => e.message)")
-        assert len(message) > 20 and message != "it loaded" and "RuntimeError" not in message, f"{name}: {message}"
+        assert len(message) > 20 and message != "it loaded" and "RuntimeError" not in message and said in message, f"{name}: {message}"
         shown = page.locator("[role=alert]").inner_text()
         assert message[:20] in shown, shown
         say(f"{name}: {message}")
     pages.shot(page, "laptop_error")
-    # Missing files are an error of the network that the browser itself logs.
-    pages.complaints[:] = [c for c in pages.complaints if "404" not in c]
+    message = page.evaluate("cc4dgs.capture({ width: 8 }).then(() => 'it is drawn', e => e.message)")
+    assert message.startswith("camera of an image") and "world_to_camera" in message, message
+    # Missing and empty files are errors of the network that the browser itself logs.
+    pages.complaints[:] = [c for c in pages.complaints if "404" not in c and "416" not in c]
     pages.quiet("errors")
 
 

@@ -31,8 +31,17 @@ def wheel(page):
         page.evaluate("([deltaMode, deltaY]) => cc4dgs.ui.canvas.dispatchEvent(new WheelEvent('wheel', { deltaMode, deltaY, cancelable: true }))", [mode, delta])
         arms.append(length(arm(page.evaluate(POSE))))
     page.evaluate("cc4dgs.reset()")
-    assert max(arms) / min(arms) < 1 + 1e-6 and arms[0] > 1.1 * length(arm(page.evaluate(POSE))), arms
-    say("a notch of the wheel zooms as far in pixels, lines and pages")
+    rest = length(arm(page.evaluate(POSE)))
+    assert max(arms) / min(arms) < 1 + 1e-6 and arms[0] > 1.1 * rest, arms
+    # A pinch on a touch pad: Chromium tells 100 times the logarithm of its factor, in many events, and Safari the factor since it began.
+    pinches = {"Chromium": "Array.from({ length: 10 }, () => new WheelEvent('wheel', { ctrlKey: true, deltaY: -10 * Math.log(2), cancelable: true }))",
+               "Safari": "[1, 1.5, 2].map((scale, k) => Object.assign(new Event(k ? 'gesturechange' : 'gesturestart', { cancelable: true }), { scale }))"}
+    for browser, events in pinches.items():
+        prevented = page.evaluate(f"{events}.every(e => !cc4dgs.ui.canvas.dispatchEvent(e))")
+        pinched = rest / length(arm(page.evaluate(POSE)))
+        assert prevented and abs(pinched - 2) < 1e-3, f"{browser}: fingers that part to twice their distance on a touch pad come {pinched:.3f} times nearer"
+        page.evaluate("cc4dgs.reset()")
+    say("a notch of the wheel zooms as far in pixels, lines and pages, and a touch pad as far as the fingers part")
 
 
 def command_key(page):
@@ -128,6 +137,9 @@ def touch(page):
     nearer = length(arm(before)) / length(arm(after))
     assert abs(nearer - 2) < 0.1, f"two fingers came {nearer:.2f} times nearer instead of 2"
     assert abs(sum(p * q for p, q in zip(arm(before), arm(after))) / (length(arm(before)) * length(arm(after))) - 1) < 1e-6, "pinching turned the camera"
+    before, after = gesture(((-50, 0), (-20, 0)), ((50, 0), (80, 0)), ((0, 60), (30, 60)))
+    aligned = sum(p * q for p, q in zip(arm(before), arm(after))) / (length(arm(before)) * length(arm(after)))
+    assert abs(aligned - 1) < 1e-6, "a third finger turns the camera"
     page.evaluate("cc4dgs.reset()")
     say(f"one finger orbits ({turned:.2f} rad), two that part come nearer ({nearer:.2f} times)")
 

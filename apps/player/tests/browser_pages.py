@@ -44,6 +44,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
                 return self.answer(part, 206, {**version, "Content-Range": place}, cut=len(part) // 2)
         if not wanted or "plain" in path:
             return self.answer(body, 200, {}, pieces)
+        if not body:
+            return self.answer(body, 416, {"Content-Range": "bytes */0"})
         part, place = self.part(wanted, body)
         self.answer(part, 206, {**version, "Content-Range": place}, pieces)
 
@@ -85,7 +87,7 @@ def serve(folder, archive):
     vast = b"NGSP" + (4).to_bytes(4, "little") + (7999999).to_bytes(4, "little") + bytes([4, 12, 0, 6]) + (32).to_bytes(4, "little") + bytes(12)
     Handler.archives = {MODEL: archive, "/plain.cc4d": archive, "/slow.cc4d": archive, "/slow-plain.cc4d": archive, "/damaged.cc4d": bytes(damaged), "/hostile.cc4d": hostile,
                         "/cut.cc4d": archive[:len(archive) // 2], "/text.cc4d": b"this is no model at all" * 9, "/gzip.cc4d": archive,
-                        "/tagged.cc4d": archive, "/vast.cc4d": vast}
+                        "/tagged.cc4d": archive, "/vast.cc4d": vast, "/empty.cc4d": b""}
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=folder))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return f"http://127.0.0.1:{server.server_port}"

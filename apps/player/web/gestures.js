@@ -21,7 +21,8 @@ export function addGestures(canvas, act, signal) {
         const [dx, dy] = [e.clientX - last.x, e.clientY - last.y];
         pointers.set(e.pointerId, { x: e.clientX, y: e.clientY });
         const height = canvas.clientHeight || 1;
-        if (pointers.size === 2) {
+        // More than two fingers do what the first two of them do.
+        if (pointers.size > 1) {
             const now = measure();
             if (spread > 0) act.zoom(now.spread / spread);
             act.pan(-(now.middle.x - middle.x) / height, -(now.middle.y - middle.y) / height);
@@ -36,7 +37,7 @@ export function addGestures(canvas, act, signal) {
     });
     const up = e => {
         pointers.delete(e.pointerId);
-        if (pointers.size === 2) ({ spread, middle } = measure());
+        if (pointers.size > 1) ({ spread, middle } = measure());
     };
     listen("pointerup", up);
     listen("pointercancel", up);
@@ -45,8 +46,17 @@ export function addGestures(canvas, act, signal) {
         e.preventDefault();
         // A notch of a wheel is about 100 pixels, 3 lines or a page.
         const pixels = e.deltaY * [1, 100 / 3, 100][e.deltaMode];
-        act.zoom(Math.exp(-pixels * 0.0015));
+        // Pinching a touch pad is told as a wheel with Ctrl, in 100 times the logarithm of the zoom; so much at once is a real wheel.
+        act.zoom(Math.exp(e.ctrlKey ? -0.01 * Math.max(-15, Math.min(15, pixels)) : -0.0015 * pixels));
     }, { passive: false });
+    // Safari tells of a pinch on a touch pad by events of its own, and of one on a screen by these and by pointers.
+    let scale = 1;
+    listen("gesturestart", e => { e.preventDefault(); scale = e.scale; });
+    listen("gesturechange", e => {
+        e.preventDefault();
+        if (!pointers.size) act.zoom(e.scale / scale);
+        scale = e.scale;
+    });
 }
 
 // Keys that switch something or save a file: held down, they do it once.

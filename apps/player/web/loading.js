@@ -130,6 +130,13 @@ export function checkSize(name, bytes) {
     if (bytes > MOST_BYTES) throw new Error(`${name} has ${(bytes / 1e9).toFixed(2)} GB, more than the ${(MOST_BYTES / 1e9).toFixed(2)} GB that the page opens. Open it on the desktop: cc4dgs view FILE`);
 }
 
+/// The bytes of `file`, a File or another Blob, for `name`.
+export async function bytesOf(name, file) {
+    try { return await file.arrayBuffer(); } catch (e) {
+        throw new Error(`${name} could not be read (${e.message}). Choose a file, not a folder; where it was moved or changed meanwhile, choose it again.`);
+    }
+}
+
 function isArchive(bytes) { return MAGIC.every((b, i) => bytes[i] === b); }
 
 /// Loads `url`; `show` has poster(bytes), part(download, layer, motion, degree, first), harmonics(download, degree), whole(name, bytes), progress(share, bytes).
@@ -141,6 +148,8 @@ export async function loadUrl(wasm, url, show, signal) {
             if (e.name === "AbortError") throw e;
             throw new Broken(`${name} could not be fetched (${e.message}). Check the address; the server must allow this page to read it.`);
         }
+        // No byte of what is asked for exists.
+        if (response.status === 416) throw new Error(`${name} is empty, or was replaced by a shorter file on its server while it was loaded. Check the file there, and load it again.`);
         if (!response.ok) throw new Error(`${name} could not be fetched: the server answered ${response.status}. Check the address.`);
         return response;
     };

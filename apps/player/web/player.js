@@ -8,7 +8,7 @@
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
 
 import init, * as wasm from "./cc4dgs_player.js";
-import { checkSize, loadUrl, nameOf } from "./loading.js";
+import { bytesOf, checkSize, loadUrl, nameOf } from "./loading.js";
 import { addGestures, addKeys, commandsOf } from "./gestures.js";
 import { WebGl } from "./webgl.js";
 import { build, savePng } from "./controls.js";
@@ -30,7 +30,10 @@ export async function createPlayer(container, options = {}) {
     const player = new Page(container, backend);
     try {
         // Another player may have it where this one could not fetch it.
-        ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined).catch(e => { ready = undefined; throw e; });
+        ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined).catch(e => {
+            ready = undefined;
+            throw new Error(`The player's module cc4dgs_player_bg.wasm could not be loaded (${e.message}). Reload the page; on a server of your own, put the file beside player.js.`);
+        });
         await ready;
         await player.start();
         const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -174,7 +177,7 @@ class Page {
             } else {
                 const label = name ?? source.name ?? "model";
                 checkSize(label, source.size ?? 0);
-                const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer?.() ?? source));
+                const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer ? bytesOf(label, source) : source));
                 if (signal.aborted) return null;
                 this.ui.title(label);
                 this.received = bytes.length;
@@ -218,6 +221,8 @@ class Page {
         const message = lines.join(" ");
         if (message) { this.ui.note(message); this.emit("warning", { message }); }
     }
+    /// Facts of the model that is drawn: while another one is fetched, those of the one before.
+    get drawnFacts() { return this.facts ?? this.shown?.facts ?? null; }
     title() { return this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source?.name ?? "model"); }
     loaded(facts) {
         this.facts = facts;
@@ -247,7 +252,7 @@ class Page {
     toggle() { this.setPlaying(!this.playing); }
     setPlaying(on) {
         if (!this.gpu) return;
-        this.gpu.playing = on && (this.facts?.frames ?? 1) > 1;
+        this.gpu.playing = on && (this.drawnFacts?.frames ?? 1) > 1;
         this.ui.playing(this.gpu.playing);
         this.emit(this.gpu.playing ? "play" : "pause", {});
     }
@@ -256,8 +261,8 @@ class Page {
     timeChanged() {
         this.dirty = true;
         if (!this.gpu) return;
-        const detail = { time: this.gpu.time, frame: this.gpu.frame, seconds: this.gpu.time * (this.facts?.seconds ?? 0) };
-        this.ui.time(detail, this.facts);
+        const facts = this.drawnFacts, detail = { time: this.gpu.time, frame: this.gpu.frame, seconds: this.gpu.time * (facts?.seconds ?? 0) };
+        this.ui.time(detail, facts);
         this.emit("time", detail);
     }
     // View
@@ -314,7 +319,7 @@ class Page {
         if (now - (this.counted ?? 0) < 1000) return;
         const rate = (this.drawn ?? 0) * 1000 / (now - (this.counted ?? now - 1000));
         [this.counted, this.drawn] = [now, 0];
-        const { facts } = this;
+        const facts = this.drawnFacts;
         if (facts && this.ui.wantsStatistics()) {
             (this.gl ? Promise.resolve(this.gl.visible) : this.gpu.countVisible()).then(visible => this.ui.statistics({ ...facts, rate, visible, received: this.received, adapter: this.gl?.name ?? this.gpu?.adapter }));
         }
@@ -378,7 +383,7 @@ class Page {
         return out;
     }
     async savePng() {
-        if (!this.facts || !this.gpu) return;
+        if (!this.drawnFacts || !this.gpu) return;
         const name = `frame_${String(this.gpu.frame).padStart(4, "0")}.png`;
         try { await savePng(await this.capture(), name); } catch (e) { this.fail(e); }
     }
@@ -392,7 +397,8 @@ class Page {
     followLink() {
         const hash = new URLSearchParams(location.hash.slice(1));
         const pose = hash.get("pose")?.split(",").map(Number);
-        if (pose?.length === 7 && this.gpu) this.gpu.pose = new Float64Array(pose);
+        // Another number of values than a pose has is ignored.
+        if (pose && this.gpu) this.gpu.pose = new Float64Array(pose);
         if (hash.has("t")) this.seek(Number(hash.get("t")));
         this.dirty = true;
     }

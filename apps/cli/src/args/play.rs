@@ -67,7 +67,7 @@ pub struct View {
     /// Stand still at this normalised time, 0 to 1, instead of playing from the first frame.
     #[arg(long, value_name = "T")]
     pub time: Option<String>,
-    /// Begin at this pose: seven numbers with commas between, as "Print command" in the window and the links of the page have them.
+    /// Begin at this pose: numbers with commas between, as "Print command" in the window and the links of the page have them.
     #[arg(long, value_name = "P", allow_hyphen_values = true)]
     pub pose: Option<String>,
     /// Device that motion is baked on, and that exact images are drawn on.

@@ -10,19 +10,19 @@ pub struct Start {
     /// Normalised time, 0..1, at which it stands still.
     pub time: Option<f32>,
     /// A pose of [`Navigator::pose`].
-    pub pose: Option<[f64; 7]>,
+    pub pose: Option<[f64; 8]>,
 }
 
 impl Start {
-    /// Reads a pose as links of the page have it: seven numbers with commas between.
+    /// Reads a pose as links of the page have it: seven numbers with commas between, or eight where the image is rolled.
     ///
     /// # Errors
     /// [`Error::Parameter`] for text that is none, and for poses that see nothing.
-    pub fn parse_pose(text: &str) -> Result<[f64; 7]> {
-        let remedy = "Write EYE_X,EYE_Y,EYE_Z,TARGET_X,TARGET_Y,TARGET_Z,FOV_Y with the vertical angle in radians, as a shared link has it";
+    pub fn parse_pose(text: &str) -> Result<[f64; 8]> {
+        let remedy = "Write EYE_X,EYE_Y,EYE_Z,TARGET_X,TARGET_Y,TARGET_Z,FOV_Y[,ROLL] with angles in radians, as a shared link has it";
         let wrong = |problem: String| Error::parameter("pose", problem, remedy);
         let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse().map_err(|_| wrong(format!("{v:?} is no number")))).collect::<Result<_>>()?;
-        let pose: [f64; 7] = numbers.try_into().map_err(|n: Vec<f64>| wrong(format!("it has {} numbers, not 7", n.len())))?;
+        let pose = Navigator::pose_of(&numbers).ok_or_else(|| wrong(format!("it has {} numbers, not 7 or 8", numbers.len())))?;
         let sees = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]).set_pose(pose);
         if sees { Ok(pose) } else { Err(wrong("a number is not finite, eye and target are one point, or the angle is not between 0.01 and 3.1".into())) }
     }
@@ -59,11 +59,12 @@ mod tests {
     #[test]
     fn a_command_says_where_it_begins() {
         let pose = [500_001.0, 5_200_000.0 - 2.5, 1.0 / 3.0, 5e5, 5.2e6, 1e-7, 0.9];
-        let start = Start { time: Some(0.37), pose: Some(pose) };
+        let start = Start { time: Some(0.37), pose: Navigator::pose_of(&pose) };
         let command = start.command("cc4dgs view", Path::new("it's here/a.cc4d"));
         assert_eq!(command, r"cc4dgs view 'it'\''s here/a.cc4d' --time 0.37 --pose=500001,5199997.5,0.333333,500000,5200000,0,0.9");
         let read = Start::parse_pose(command.split_once("--pose=").unwrap().1).unwrap();
         assert!(read.iter().zip(pose).all(|(a, b)| (a - b).abs() < 1e-6), "{read:?}");
+        assert_eq!(Start::parse_pose("3,0,0,0,0,0,0.9,-0.25").unwrap(), [3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, -0.25]);
         assert_eq!(Start::default().command("cc4dgs view", Path::new("runs/mutant")), "cc4dgs view runs/mutant");
     }
 

@@ -178,7 +178,8 @@ impl Player {
     fn view_of(&self, camera: Option<String>, time: Option<f32>) -> Result<View, JsError> {
         let mut view = self.view();
         if let Some(json) = camera {
-            view.camera = serde_json::from_str(&json).map_err(error)?;
+            let remedy = "Give name, width, height, fx, fy, cx, cy and world_to_camera (four rows of four numbers)";
+            view.camera = serde_json::from_str(&json).map_err(|e| error(Error::parameter("camera of an image", e.to_string(), remedy)))?;
             view.camera.validate().map_err(error)?;
             LIMITS.check_pixels("captured image", view.camera.width.into(), view.camera.height.into()).map_err(error)?;
             let side = view.camera.width.max(view.camera.height);
@@ -335,7 +336,7 @@ impl Player {
             self.navigator.go_to(camera);
         }
     }
-    /// Eye, target and vertical angle: seven numbers.
+    /// Eye, target, vertical angle and roll: eight numbers.
     #[wasm_bindgen(getter)]
     pub fn pose(&self) -> Vec<f64> {
         self.navigator.pose().to_vec()
@@ -345,10 +346,10 @@ impl Player {
     pub fn pose_text(&self) -> String {
         Navigator::pose_text(self.navigator.pose())
     }
-    /// Takes a pose of the getter.
+    /// Takes a pose of the getter; without roll it may have seven numbers. Others are ignored.
     #[wasm_bindgen(setter)]
     pub fn set_pose(&mut self, pose: Vec<f64>) {
-        if let Ok(pose) = pose.try_into() {
+        if let Some(pose) = Navigator::pose_of(&pose) {
             self.navigator.set_pose(pose);
         }
     }
