@@ -7,6 +7,7 @@ use cc4dgs_core::{Error, Result};
 use serde::Serialize;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The first key of every result: the version of the program that wrote it. Files that begin otherwise are not replaced.
 const MARK: &str = "cc4dgs";
@@ -15,11 +16,13 @@ const MARK: &str = "cc4dgs";
 pub struct Output {
     json: Option<PathBuf>,
     quiet: bool,
+    /// Whether standard output has the JSON of a result.
+    printed: AtomicBool,
 }
 
 impl Output {
     pub fn new(json: Option<PathBuf>, quiet: bool) -> Self {
-        Self { json, quiet }
+        Self { json, quiet, printed: AtomicBool::new(false) }
     }
     /// Whether progress is unwanted.
     pub fn quiet(&self) -> bool {
@@ -47,7 +50,17 @@ impl Output {
             Some(path) => {
                 let json = to_json(value);
                 if path.as_os_str() == "-" {
-                    return print(&json?);
+                    return match json {
+                        Ok(json) => {
+                            self.printed.store(true, Ordering::Relaxed);
+                            print(&json)
+                        }
+                        Err(error) => {
+                            // Standard output is for JSON; what was measured is not lost.
+                            writeln!(std::io::stderr(), "{}", text()).ok();
+                            Err(error)
+                        }
+                    };
                 }
                 let written = json.and_then(|json| create_parent(path).and_then(|()| write_atomically(path, json.as_bytes())));
                 // What was measured is shown where its file cannot be written, too.
@@ -56,20 +69,28 @@ impl Output {
             }
         }
     }
-    /// Reports a failure: a line on standard error, and an object on standard output where JSON was expected there.
+    /// Reports a failure: a line on standard error, and an object on standard output where JSON was expected there and none was written.
     pub fn failure(&self, error: &Error) {
         // If the streams themselves are broken, nothing can be reported.
         writeln!(std::io::stderr(), "error: {error}").ok();
-        if self.json.as_ref().is_some_and(|p| p.as_os_str() == "-") {
-            let object = serde_json::json!({ "error": { "message": error.to_string(), "exit_code": error.exit_code() } });
+        if let Some(object) = self.failure_object(error) {
             writeln!(std::io::stdout(), "{object}").ok();
         }
+    }
+    /// What standard output gets of a failure. Commands such as `stress` fail after they wrote their result: a second object behind it would be no JSON.
+    fn failure_object(&self, error: &Error) -> Option<serde_json::Value> {
+        let wanted = self.json.as_ref().is_some_and(|p| p.as_os_str() == "-") && !self.printed.load(Ordering::Relaxed);
+        wanted.then(|| serde_json::json!({ "error": { "message": error.to_string(), "exit_code": error.exit_code() } }))
     }
 }
 
 /// Indented JSON with a final newline. Objects begin with [`MARK`]; of a list, each of its objects does.
 pub fn to_json(value: &impl Serialize) -> Result<String> {
-    let text = serde_json::to_string_pretty(value).map_err(|e| Error::backend("JSON", e.to_string(), "Report this: every result should have a JSON form"))?;
+    let text = serde_json::to_string_pretty(value).map_err(|e| match e.to_string() {
+        // The words of serde about paths.
+        problem if problem.contains("invalid UTF-8") => Error::parameter("--json", problem, "Give files and folders names in Unicode, or leave --json out"),
+        problem => Error::backend("JSON", problem, "Report this: every result should have a JSON form"),
+    })?;
     let begin = |indent: &str| format!("{indent}{{\n{indent}  \"{MARK}\": \"{}\",\n", env!("CARGO_PKG_VERSION"));
     let marked = match text.strip_prefix("{\n") {
         Some(rest) => begin("") + rest,
@@ -101,6 +122,36 @@ mod tests {
         };
         assert!(Output::new(Some(no_folder.join("out.json")), true).result(&serde_json::json!({ "psnr_db": 30.5 }), text).is_err());
         assert!(shown);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_name_that_is_not_unicode_loses_no_result() {
+        let name: &std::ffi::OsStr = std::os::unix::ffi::OsStrExt::from_bytes(b"model\xff");
+        let value = std::collections::BTreeMap::from([("model", PathBuf::from(name))]);
+        let output = Output::new(Some("-".into()), true);
+        let mut shown = false;
+        let text = || {
+            shown = true;
+            String::new()
+        };
+        let error = output.result(&value, text).unwrap_err();
+        assert!(shown && error.exit_code() == 2 && error.to_string().contains("leave --json out"), "{error}");
+        assert!(output.failure_object(&error).is_some(), "nothing else is on standard output");
+    }
+
+    #[test]
+    fn standard_output_has_one_document() {
+        let error = Error::failed("training a", "it is hopeless", "Look at its images");
+        let output = Output::new(Some("-".into()), true);
+        let object = output.failure_object(&error).unwrap();
+        assert_eq!(object["error"]["exit_code"], 6);
+        output.result(&serde_json::json!([{ "outcome": "hopeless" }]), String::new).unwrap();
+        assert_eq!(output.failure_object(&error), None, "the result is there already");
+        let folder = tempfile::tempdir().unwrap();
+        for json in [None, Some(folder.path().join("out.json"))] {
+            assert_eq!(Output::new(json, true).failure_object(&error), None);
+        }
     }
 
     #[test]

@@ -66,6 +66,7 @@ fn mistakes_end_with_their_own_exit_code() {
         ("export splatv x --frames 3 --out y.splatv", "splatv holds the whole time"),
         ("export ply-sequence x --fps 3 --out y", "how fast it is played"),
         ("render x --fps 3 --out y", "--mp4"),
+        ("eval x --scene y --sheet a.png --sheet-rows 0", "--sheet a.png: --sheet-rows 0 draws"),
         ("compress x --codec kwantize --out y.cc4d", "quantize"),
         ("compress x --codec raw --set bitz=3 --out y.cc4d", "bitz"),
         ("compress x --field-weights compact:max-drop=0.01dB --out y.cc4d", "'compact:max-drop=0.01dB': a loss of PSNR"),

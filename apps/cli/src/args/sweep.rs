@@ -112,21 +112,21 @@ pub struct SweepEmit {
     /// Memory of a job in GB.
     #[arg(long, value_name = "GB", default_value_t = 8)]
     pub memory_gb: u32,
-    /// Time limit of a job in minutes. A job that reaches it leaves a checkpoint and goes on later.
+    /// Time limit of a job in minutes; for slurm at least 4. A job that reaches it leaves a checkpoint and goes on later.
     #[arg(long, value_name = "M", default_value_t = 240)]
     pub time_limit: u32,
     /// Jobs at a time (slurm, k8s); 0 leaves it to the scheduler.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub parallel: usize,
-    /// Container image (k8s).
-    #[arg(long, value_name = "NAME", default_value = "cc4dgs:latest")]
-    pub image: String,
-    /// Persistent volume claim (k8s).
-    #[arg(long, value_name = "NAME", default_value = "cc4dgs")]
-    pub claim: String,
-    /// Bucket (skypilot).
-    #[arg(long, value_name = "URL", default_value = "s3://cc4dgs")]
-    pub bucket: String,
+    /// Container image; k8s only [default: cc4dgs:latest].
+    #[arg(long, value_name = "NAME")]
+    pub image: Option<String>,
+    /// Persistent volume claim; k8s only [default: cc4dgs].
+    #[arg(long, value_name = "NAME")]
+    pub claim: Option<String>,
+    /// Bucket; skypilot only [default: s3://cc4dgs].
+    #[arg(long, value_name = "URL")]
+    pub bucket: Option<String>,
     /// Environment variable of the jobs; may be given several times. k8s and skypilot need those that paths of scenes start from, such as CC4DGS_DATA; slurm takes
     /// their values here where they are not given.
     #[arg(long = "env", value_name = "NAME=VALUE")]

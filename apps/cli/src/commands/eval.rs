@@ -68,6 +68,9 @@ pub struct Images {
 }
 
 pub fn run(context: &Context, args: &Eval) -> Result<()> {
+    if let (Some(sheet), 0) = (&args.sheet, args.sheet_rows) {
+        return Err(Error::parameter(format!("--sheet {}", sheet.display()), "--sheet-rows 0 draws no contact sheet", "Leave one of the two out"));
+    }
     let split = args.views.split.into();
     let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
     let images = Images { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };

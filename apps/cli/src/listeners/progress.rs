@@ -19,6 +19,8 @@ pub struct Progress {
 struct State {
     /// The visible bar and its task.
     bar: Option<(String, ProgressBar)>,
+    /// Whether the bar has had a position.
+    placed: bool,
     last_line: Option<Instant>,
 }
 
@@ -48,7 +50,7 @@ impl State {
             bar.set_prefix(task.to_string());
             // Without a terminal, short tasks get no line of their own.
             self.last_line = Some(Instant::now());
-            self.bar = Some((task.to_string(), bar));
+            (self.bar, self.placed) = (Some((task.to_string(), bar)), false);
         }
         let (_, bar) = self.bar.get_or_insert_with(|| (task.to_string(), ProgressBar::hidden()));
         match total {
@@ -63,14 +65,24 @@ impl State {
         }
     }
     fn advance(&mut self, task: &str, done: u64, total: u64, message: String, terminal: bool) {
-        let bar = self.bar(task, total, terminal);
+        let bar = self.bar(task, total, terminal).clone();
         bar.set_position(done);
+        let first = !std::mem::replace(&mut self.placed, true);
+        if first && done > 1 {
+            // What was done before an interruption took no time here.
+            bar.reset_eta();
+        }
         let eta = bar.eta();
         bar.set_message(message.clone());
         let due = self.last_line.is_none_or(|at| at.elapsed() >= LINE_INTERVAL);
         if !terminal && due {
             self.last_line = Some(Instant::now());
-            let rest = if total > 0 { format!("/{total} eta {}s", eta.as_secs()) } else { String::new() };
+            let rest = match total {
+                0 => String::new(),
+                // No pace is known yet.
+                _ if eta.is_zero() => format!("/{total}"),
+                _ => format!("/{total} eta {}s", eta.as_secs()),
+            };
             self.say(&format!("{task} {done}{rest} {message}"));
         }
         if total > 0 && done >= total {
@@ -122,6 +134,7 @@ impl EventSink for Progress {
 #[cfg(test)]
 mod tests {
     use super::{State, work};
+    use std::time::Duration;
 
     #[test]
     fn a_task_of_unknown_length_goes_on_and_others_end() {
@@ -130,6 +143,18 @@ mod tests {
         assert!(state.bar.is_some());
         state.advance("read", 3, 3, String::new(), false);
         assert!(state.bar.is_none());
+    }
+
+    #[test]
+    fn the_pace_is_that_of_this_process() {
+        // A training that goes on at iteration 3000 of 4000.
+        let mut state = State::default();
+        for done in [3000, 3001] {
+            state.advance("main", done, 4000, String::new(), false);
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let eta = state.bar.as_ref().map(|(_, bar)| bar.eta()).unwrap();
+        assert!(eta > Duration::from_secs(5), "999 iterations of at least 20 ms, not {eta:?}");
     }
 
     #[test]

@@ -14,6 +14,8 @@ const FINAL: [u8; 3] = [2, 3, 6];
 const INDEX_VARIABLES: [&str; 4] = ["SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "INDEX"];
 /// Seconds before a time limit at which a job is asked to stop.
 const NOTICE_SECONDS: u32 = 120;
+/// Least time limit of a job of Slurm, minutes. Slurm may give the notice a minute earlier, and a task that is stopped at once is queued again without end.
+const LEAST_SLURM_MINUTES: u32 = 4;
 
 /// A scheduler.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,7 +46,8 @@ pub struct EmitOptions {
     pub variables: Vec<String>,
     /// Memory of a job in GB (10^9 bytes).
     pub memory_gb: u32,
-    /// Time limit of a job in minutes. A job that reaches it leaves a checkpoint and is run again: SkyPilot does so three times, the others as often as needed.
+    /// Time limit of a job in minutes, for Slurm at least four. A job that reaches it leaves a checkpoint and is run again: SkyPilot does so three times, the
+    /// others as often as needed.
     pub minutes: u32,
     /// Jobs at a time; 0 is as many as the scheduler starts. SkyPilot has no such number.
     pub parallel: usize,
@@ -59,8 +62,8 @@ pub struct EmitOptions {
 /// The file for `scheduler`.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a plan without trainings, for texts that no quoting makes safe, for wrong or missing variables, and for a number of jobs that
-/// SkyPilot would not keep to.
+/// [`Error::Parameter`] for a plan without trainings, for texts that no quoting makes safe, for wrong or missing variables, for a time limit that leaves jobs
+/// of Slurm no time to work, and for a number of jobs that SkyPilot would not keep to.
 pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<String> {
     if plan.trainings.is_empty() {
         return Err(Error::parameter(format!("sweep {}", plan.name), "it has no training", "Make the plan again from a grid with at least one cell"));
@@ -78,9 +81,13 @@ pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<
     if o.threads == 0 || o.memory_gb == 0 || o.minutes == 0 {
         return Err(Error::parameter("sweep emit", "threads, memory and minutes are positive", "Give --threads, --memory-gb and --time-limit"));
     }
-    if scheduler == Scheduler::Slurm && o.folder.contains('\\') {
-        let problem = format!("'{}' has a backslash, and names of Slurm's logs would then not get the index of their task", o.folder);
+    if scheduler == Scheduler::Slurm && folder_of_logs(o).contains('\\') {
+        let problem = format!("'{}' has a backslash, and names of Slurm's logs would then not get the index of their task", folder_of_logs(o));
         return Err(Error::parameter("folder", problem, "Use another folder, or name it by a link without a backslash (--job-dir)"));
+    }
+    if scheduler == Scheduler::Slurm && o.minutes < LEAST_SLURM_MINUTES {
+        let problem = format!("{} minutes: Slurm asks a task to stop up to three minutes before its limit, so it would be queued again without end", o.minutes);
+        return Err(Error::parameter("--time-limit", problem, format!("Give at least {LEAST_SLURM_MINUTES} minutes")));
     }
     if scheduler == Scheduler::SkyPilot && o.parallel > 0 {
         let problem = format!("{}: SkyPilot itself decides how many managed jobs run at a time", o.parallel);
@@ -151,6 +158,12 @@ fn limit_options(o: &EmitOptions) -> String {
     o.limits.iter().map(|limit| format!("--limit {} ", quoted(limit))).collect()
 }
 
+/// The folder of Slurm's logs. Slurm looks for a relative one where `sbatch` is called, and the program in its working folder, where it has to be.
+fn folder_of_logs(o: &EmitOptions) -> String {
+    let root = if o.folder.starts_with('/') { String::new() } else { format!("{}/", o.working_folder.trim_end_matches('/')) };
+    format!("{root}{}/logs", o.folder)
+}
+
 /// `text`, which has no backslash, as one word of an `#SBATCH` line. sbatch reads these lines by rules of its own: a backslash escapes within quotes, too.
 fn sbatch_quoted(text: &str) -> String {
     format!("\"{}\"", text.replace('"', "\\\""))
@@ -176,7 +189,7 @@ fn job_name(plan: &Plan) -> String {
 fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
     let last = plan.trainings.len() - 1;
     let throttle = if o.parallel > 0 { format!("%{}", o.parallel) } else { String::new() };
-    let output = sbatch_quoted(&format!("{}/logs/slurm-%a.log", o.folder.replace('%', "%%")));
+    let output = sbatch_quoted(&format!("{}/slurm-%a.log", folder_of_logs(o).replace('%', "%%")));
     format!(
         r#"#!/bin/bash
 # {trainings} trainings, {cells} cells. Submit with: sbatch FILE. A task that is stopped before its time limit, or preempted, leaves a checkpoint and

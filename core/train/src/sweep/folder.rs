@@ -1,5 +1,6 @@
 //! The folder of a sweep: where everything lies, and how far it is.
 
+use super::emit::INTERRUPTED;
 use super::lock::TrainingLock;
 use super::plan::{Plan, PlannedCell};
 use super::read::RESULTS;
@@ -103,7 +104,8 @@ impl SweepFolder {
         }
         let run = self.training(training);
         let trained = run.join(FINISHED).is_file();
-        if let Some(failure) = self.failure(training) {
+        // The pool remembers processes that were asked to stop, too.
+        if let Some(failure) = self.failure(training).filter(|failure| failure.exit_code != INTERRUPTED) {
             let what = if trained { "trained, then failed" } else { "failed" };
             return format!("{what} with exit code {}: {}", failure.exit_code, failure.message);
         }
@@ -160,6 +162,8 @@ mod tests {
         assert!(folder.state(&id).contains("goes on"));
         folder.set_failure(&id, Some(&Failure { exit_code: 4, message: "out of memory".into() })).unwrap();
         assert!(folder.state(&id).contains("exit code 4: out of memory"));
+        folder.set_failure(&id, Some(&Failure { exit_code: INTERRUPTED, message: "the process was asked to stop".into() })).unwrap();
+        assert!(folder.state(&id).contains("goes on"), "{}", folder.state(&id));
         folder.set_failure(&id, None).unwrap();
         folder.set_failure(&id, None).unwrap();
         let lock = TrainingLock::take(&folder.lock(&id)).unwrap();

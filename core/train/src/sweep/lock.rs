@@ -31,7 +31,8 @@ impl TrainingLock {
     /// Who holds the lock at `path`, if somebody does.
     pub fn holder(path: &Path) -> Option<String> {
         let mut file = OpenOptions::new().read(true).write(true).open(path).ok()?;
-        match file.try_lock() {
+        // Shared, so that two that ask at a time do not take each other for holders.
+        match file.try_lock_shared() {
             Err(TryLockError::WouldBlock) => {}
             _ => return None,
         }
@@ -58,5 +59,9 @@ mod tests {
         assert!(holder.starts_with(&format!("process {} on", std::process::id())) && !holder.contains("nowhere"), "{holder}");
         drop(lock);
         assert!(TrainingLock::holder(&path).is_none() && TrainingLock::take(&path).unwrap().is_some());
+        // Somebody else who asks holds nothing.
+        let asking = File::open(&path).unwrap();
+        asking.lock_shared().unwrap();
+        assert_eq!(TrainingLock::holder(&path), None);
     }
 }

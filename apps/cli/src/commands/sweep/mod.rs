@@ -11,6 +11,7 @@ use cc4dgs_train::sweep::{
     Busy, Collection, EmitOptions, Grid, Outcome, Plan, Scheduler, SweepFolder, Tables, TrainingState, Worker, collect as collect_results, emit as emit_file,
     run_training, select, summary, write_tables,
 };
+use clap::ValueEnum;
 use serde::Serialize;
 use std::path::Path;
 
@@ -49,7 +50,7 @@ pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
         folder: args.out.as_ref().map(|out| out.display().to_string()),
     };
     context.output.result(&report, || {
-        let time = report.minutes.map_or_else(String::new, |minutes| format!(", about {:.1} hours of training", minutes / 60.0));
+        let time = report.minutes.map_or_else(String::new, |minutes| format!(", about {} of training", pool::duration(60.0 * minutes)));
         let next = match &report.folder {
             Some(folder) => format!("run it: {} sweep run {}", program(), word(folder)),
             None => "nothing was written; --out DIR writes the plan".into(),
@@ -173,7 +174,22 @@ struct EmitReport {
     file: String,
 }
 
+/// Refuses options of other schedulers, which would have no effect.
+fn check_scheduler(args: &SweepEmit) -> Result<()> {
+    let named = |value: &SchedulerArg| value.to_possible_value().map_or_else(String::new, |value| value.get_name().to_string());
+    let options =
+        [("--image", &args.image, SchedulerArg::K8s), ("--claim", &args.claim, SchedulerArg::K8s), ("--bucket", &args.bucket, SchedulerArg::Skypilot)];
+    match options.into_iter().find(|(_, value, of)| value.is_some() && *of != args.scheduler) {
+        Some((option, value, of)) => {
+            let (object, own) = (format!("{option} {}", value.as_deref().unwrap_or_default()), named(&args.scheduler));
+            Err(Error::parameter(object, format!("it is an option of {}, and has no effect on jobs of {own}", named(&of)), "Leave it out"))
+        }
+        None => Ok(()),
+    }
+}
+
 pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
+    check_scheduler(args)?;
     let plan = Plan::read(&args.dir)?;
     // Schedulers want the folder of their logs to exist.
     SweepFolder::new(&args.dir).create()?;
@@ -193,9 +209,9 @@ pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
         memory_gb: args.memory_gb,
         minutes: args.time_limit,
         parallel: args.parallel,
-        image: args.image.clone(),
-        claim: args.claim.clone(),
-        bucket: args.bucket.clone(),
+        image: args.image.clone().unwrap_or_else(|| "cc4dgs:latest".into()),
+        claim: args.claim.clone().unwrap_or_else(|| "cc4dgs".into()),
+        bucket: args.bucket.clone().unwrap_or_else(|| "s3://cc4dgs".into()),
     };
     let scheduler = match args.scheduler {
         SchedulerArg::Slurm => Scheduler::Slurm,
@@ -213,6 +229,24 @@ mod tests {
     #[test]
     fn paths_with_spaces_are_one_word_of_the_next_command() {
         assert_eq!(["runs/tiny-1", "my runs", "it's", ""].map(word), ["runs/tiny-1", "'my runs'", "'it'\\''s'", "''"]);
+    }
+
+    #[test]
+    fn options_of_other_schedulers_are_refused() {
+        use crate::args::{Cli, Command, SweepWhat};
+        let checked = |line: &str| {
+            let cli = <Cli as clap::Parser>::try_parse_from(format!("cc4dgs sweep emit {line}").split(' ')).unwrap();
+            let Cli { command: Command::Sweep(sweep), .. } = cli else { panic!("{line}") };
+            let SweepWhat::Emit(args) = sweep.what else { panic!("{line}") };
+            check_scheduler(&args).map_err(|error| error.to_string())
+        };
+        for line in ["slurm d", "k8s d --image a --claim b", "skypilot d --bucket s3://c"] {
+            assert_eq!(checked(line), Ok(()));
+        }
+        for (line, parts) in [("slurm d --image a", ["--image a", "k8s", "slurm"]), ("k8s d --bucket s3://c", ["--bucket s3://c", "skypilot", "k8s"])] {
+            let message = checked(line).unwrap_err();
+            assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
     }
 
     #[test]

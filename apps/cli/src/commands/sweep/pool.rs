@@ -97,7 +97,12 @@ impl Pool<'_> {
             }
             while self.running.len() < jobs && Instant::now() >= self.not_before {
                 let Some(index) = self.queue.pop_front() else { break };
-                self.start(index)?;
+                // Another pool may have done it meanwhile.
+                if self.complete(index) {
+                    self.progress();
+                } else {
+                    self.start(index)?;
+                }
             }
             if self.running.is_empty() && self.queue.is_empty() {
                 return Ok(());
@@ -105,6 +110,10 @@ impl Pool<'_> {
             self.look(jobs)?;
             std::thread::sleep(TICK);
         }
+    }
+    /// Whether all cells of the training at `index` have results.
+    fn complete(&self, index: usize) -> bool {
+        self.plan.cells_of(&self.plan.trainings[index].id).all(|cell| self.folder.finished(cell).is_some())
     }
     /// How many cells are finished. A result is read once.
     fn finished(&mut self) -> usize {
@@ -155,9 +164,10 @@ impl Pool<'_> {
         Ok(())
     }
     fn ended(&mut self, job: &Job, status: ExitStatus, jobs: usize) -> Result<()> {
-        let training = &self.plan.trainings[job.index];
-        let complete = self.plan.cells_of(&training.id).all(|cell| self.folder.finished(cell).is_some());
+        let (training, complete) = (&self.plan.trainings[job.index], self.complete(job.index));
         match status.code() {
+            // Another process did it, so its time says nothing here.
+            Some(code) if complete && code == i32::from(BUSY) => {}
             // A hopeless training has results too.
             _ if complete => {
                 let seconds = job.began.elapsed().as_secs_f64();
@@ -184,17 +194,7 @@ impl Pool<'_> {
     fn failure(&self, job: &Job, status: ExitStatus) -> Failure {
         let id = &self.plan.trainings[job.index].id;
         let log = std::fs::read(self.folder.log(id)).unwrap_or_default();
-        let last = last_words(log.get(job.log_start as usize..).unwrap_or_default());
-        match (status.code(), signal(status)) {
-            (Some(code), _) => match self.folder.failure(id) {
-                Some(said) if i32::from(said.exit_code) == code => said,
-                _ => Failure { exit_code: u8::try_from(code).unwrap_or(1), message: last },
-            },
-            (None, Some(9)) => Failure { exit_code: 4, message: "the process was killed, most likely because memory ran out; use fewer --jobs".into() },
-            (None, Some(6)) if last.contains("memory allocation") => Failure { exit_code: 4, message: last },
-            (None, Some(2 | 15)) => Failure { exit_code: INTERRUPTED, message: "the process was asked to stop".into() },
-            (None, other) => Failure { exit_code: 1, message: format!("the process was ended by signal {}: {last}", other.unwrap_or(0)) },
-        }
+        why(status.code(), signal(status), self.folder.failure(id), log.get(job.log_start as usize..).unwrap_or_default())
     }
     /// Trainings done and the time that the others will take.
     fn left(&mut self, jobs: usize) -> String {
@@ -229,6 +229,26 @@ impl Pool<'_> {
         let object = format!("sweep {}", self.folder.root().display());
         let problem = format!("{} of {} trainings failed: {}{rest}", self.failed.len(), self.plan.trainings.len(), named.join("; "));
         of_exit_code(self.failed.first().map_or(1, |(_, failure)| failure.exit_code), object, problem)
+    }
+}
+
+/// Why a process with this exit code, or ended by this signal, left cells without results. What is `recorded` of the training is that of an earlier process
+/// where the `log` of this one does not contain it.
+fn why(code: Option<i32>, signal: Option<i32>, recorded: Option<Failure>, log: &[u8]) -> Failure {
+    let last = last_words(log);
+    match (code, signal) {
+        (Some(0), _) => {
+            let message = "its process ended well, but a result is missing: another plan or another process changed the folder meanwhile; run the sweep again";
+            Failure { exit_code: 1, message: message.into() }
+        }
+        (Some(code), _) => match recorded {
+            Some(said) if i32::from(said.exit_code) == code && String::from_utf8_lossy(log).contains(&said.message) => said,
+            _ => Failure { exit_code: u8::try_from(code).unwrap_or(1), message: last },
+        },
+        (None, Some(9)) => Failure { exit_code: 4, message: "the process was killed, most likely because memory ran out; use fewer --jobs".into() },
+        (None, Some(6)) if last.contains("memory allocation") => Failure { exit_code: 4, message: last },
+        (None, Some(2 | 15)) => Failure { exit_code: INTERRUPTED, message: "the process was asked to stop".into() },
+        (None, other) => Failure { exit_code: 1, message: format!("the process was ended by signal {}: {last}", other.unwrap_or(0)) },
     }
 }
 
@@ -287,7 +307,7 @@ fn ask_to_stop(child: &mut Child) {
 }
 
 /// Seconds for people.
-fn duration(seconds: f64) -> String {
+pub(super) fn duration(seconds: f64) -> String {
     match seconds.max(0.0) {
         s if s < 100.0 => format!("{s:.0} s"),
         s if s < 6000.0 => format!("{:.0} min", s / 60.0),
@@ -299,7 +319,32 @@ fn duration(seconds: f64) -> String {
 mod tests {
     use super::*;
     use crate::args::{Cli, SweepWhat};
+    use crate::output::Output;
+    use cc4dgs_core::{Limits, Registry, Silent};
+    use cc4dgs_train::sweep::{CellResult, Grid};
     use clap::Parser;
+
+    #[test]
+    fn what_another_pool_has_done_is_not_begun_and_has_no_time() {
+        let (registry, output, root) = (Registry::collect().unwrap(), Output::new(None, true), tempfile::tempdir().unwrap());
+        let grid = Grid::parse("tiny.toml", include_str!("../../../../../benches/grids/tiny.toml")).unwrap();
+        let plan = Plan::expand(&grid, &registry, &|_| Ok(())).unwrap();
+        let folder = SweepFolder::new(root.path());
+        folder.create().unwrap();
+        let documented = include_str!("../../../../../docs/results.md").split("```json\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        let mut result = CellResult::from_json("docs/results.md", documented).unwrap();
+        for cell in plan.cells_of(&plan.trainings[0].id) {
+            (result.id, result.training) = (cell.id.clone(), cell.training.clone());
+            result.write(&folder.result(&cell.id)).unwrap();
+        }
+        let context = &Context { registry, output: &output, limits: Limits::default(), limit_options: &[] };
+        let (plan, folder, events, not_before) = (&plan, &folder, &Silent, Instant::now());
+        let (running, seconds, failed, done) = (Vec::new(), Vec::new(), Vec::new(), BTreeSet::new());
+        let mut pool = Pool { context, plan, folder, threads: 1, processes: 1, events, queue: [0].into(), running, seconds, failed, done, not_before };
+        pool.work(1, &AtomicBool::new(false)).unwrap();
+        assert!(pool.seconds.is_empty() && pool.failed.is_empty() && !folder.log(&plan.trainings[0].id).exists());
+        assert_eq!(pool.finished(), 2);
+    }
 
     #[test]
     fn processes_are_told_their_share() {
@@ -328,6 +373,19 @@ mod tests {
         assert_eq!(last_words(panic.as_bytes()), "thread 'main' (7) panicked at src/a.rs:1:2: index out of bounds");
         assert_eq!([&b"a\n b\n\n"[..], b"\xff"].map(last_words), ["b", "\u{fffd}"]);
         assert_eq!(last_words(b""), "it said nothing");
+    }
+
+    #[test]
+    fn failures_of_earlier_processes_are_not_repeated() {
+        let recorded = || Some(Failure { exit_code: 3, message: "scene a: it changed. Plan again".into() });
+        let of = |code, log: &str| why(Some(code), None, recorded(), log.as_bytes());
+        assert_eq!(Some(of(3, "thread 'a' panicked at b:\nc\nerror: scene a: it changed. Plan again\n")), recorded());
+        assert_eq!(of(3, "error: a.lock: no locks available").message, "error: a.lock: no locks available");
+        assert_eq!(of(2, "error: --plan b: c"), Failure { exit_code: 2, message: "error: --plan b: c".into() });
+        // A success without a result is none, and is not called a failure with exit code 0.
+        let success = of(0, "");
+        assert!(success.exit_code != 0 && success.message.contains("a result is missing"), "{success:?}");
+        assert_eq!(why(None, Some(15), None, b"").exit_code, INTERRUPTED);
     }
 
     #[test]

@@ -149,6 +149,8 @@ fn sbatch_finds_the_log_in_any_folder() {
         assert_eq!(output(folder), [format!("--output={folder}/logs/slurm-%a.log")]);
     }
     assert_eq!(output("/100 %"), ["--output=/100 %%/logs/slurm-%a.log"]);
+    // The program looks for a relative folder in its working folder.
+    assert_eq!(output("runs/a"), ["--output=/data/runs/a/logs/slurm-%a.log"]);
     let error = emit(Scheduler::Slurm, &plan(), &EmitOptions { folder: "/a\\b".into(), ..options() }).unwrap_err().to_string();
     assert!(error.contains("backslash") && error.contains("--job-dir"), "{error}");
 }
@@ -157,7 +159,9 @@ fn sbatch_finds_the_log_in_any_folder() {
 fn jobs_stop_before_their_time_limit() {
     assert_eq!([1, 2, 3, 60, u32::MAX].map(stop_after), [60, 60, 60, 3480, 2_147_483_647]);
     let of = |scheduler, minutes| emit(scheduler, &plan(), &EmitOptions { minutes, ..options() }).unwrap();
-    assert!(of(Scheduler::Slurm, 90).contains("#SBATCH --time=90\n"));
+    assert!(of(Scheduler::Slurm, 90).contains("#SBATCH --time=90\n") && of(Scheduler::Slurm, 4).contains("#SBATCH --time=4\n"));
+    let error = emit(Scheduler::Slurm, &plan(), &EmitOptions { minutes: 3, ..options() }).unwrap_err().to_string();
+    assert!(error.contains("--time-limit: 3 minutes") && error.contains("at least 4 minutes"), "{error}");
     let pod = parse(&of(Scheduler::Kubernetes, 90));
     assert_eq!(pod["spec"]["template"]["spec"]["activeDeadlineSeconds"], 5280);
     assert!(pod["spec"].get("activeDeadlineSeconds").is_none(), "that would be a limit for all indices together");
