@@ -17,6 +17,10 @@ use std::slice;
 pub const CODED: &str = "coded";
 /// Largest step over the tolerance of a plug-in; a little is left for float32.
 const STEP_OF_TOLERANCE: f64 = 1.99;
+/// Largest step over what is left of a tolerance once values are rounded to float32; steps are rounded themselves.
+const STEP_OF_REST: f64 = 1.999_999;
+/// Largest error of a number that is rounded to float32, over the number.
+const ROUNDING: f64 = 1.0 / (1u64 << 24) as f64;
 /// Shifts are at most this.
 const MOST_SHIFT: u8 = 15;
 
@@ -41,7 +45,7 @@ impl Coding {
         let rows = needed(attribute, gaussians.len());
         let (origins, spread) = moments(attribute, &rows);
         let unit = if of.growth == Growth::Size { libm::exp2(geometry.size_floor as f64 / 65536.0) } else { 1.0 };
-        let tolerance = attribute.tolerance.map_or(f64::INFINITY, |t| STEP_OF_TOLERANCE * f64::from(t));
+        let tolerance = attribute.tolerance.map_or(f64::INFINITY, |t| largest_step(attribute, &rows, f64::from(t)));
         let largest = (LARGEST * spread).min(tolerance);
         if !(spread.is_finite() && tolerance > 0.0) {
             return None;
@@ -165,6 +169,15 @@ impl<'a> Coded<'a> {
     }
 }
 
+/// The largest step with which the stored rows of an attribute are within `tolerance`. It is not above 0 where none is small enough, because rounding to float32
+/// alone may change large values by as much.
+fn largest_step(attribute: &ExtraAttribute, rows: &[bool], tolerance: f64) -> f64 {
+    let stored = attribute.values.chunks_exact(attribute.width.max(1)).zip(rows).filter(|(_, stored)| **stored);
+    let largest = stored.flat_map(|(row, _)| row).fold(0.0f32, |largest, v| largest.max(v.abs()));
+    let rounding = (f64::from(largest) + tolerance) * ROUNDING;
+    (STEP_OF_TOLERANCE * tolerance).min(STEP_OF_REST * (tolerance - rounding))
+}
+
 /// What predicts a column of a row: its classes, and the columns before.
 fn known(color: u8, shape: u8, shift: u8, column: usize, before: impl Fn(usize) -> i32) -> Known {
     let mut out = Known { classes: [color, shape], class: shape, shift, ..Default::default() };
@@ -283,4 +296,36 @@ fn read_coded(set: &StreamSet, coding: &Coding, kind: u8, rows: &RowFacts, plans
         stored.iter().zip(found).for_each(|(&i, code)| codes[i * width + column] = code);
     }
     Ok(coding.restored(&codes, &flags, &shifts))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_format::Seed;
+
+    /// The largest error of values from `middle` - 1 to `middle` + 1 that may have one of `tolerance`; `None` where they are not coded.
+    fn worst(middle: f32, tolerance: f32) -> Option<f32> {
+        let count = 4000;
+        let draw = |k: usize| (Seed::root(5).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+        let mut g = HostGaussians { opacity_logits: vec![0.0; count], ..Default::default() };
+        g.extra.insert("a".into(), ExtraAttribute::exact(1, (0..count).map(|k| middle + draw(k)).collect()).within(tolerance));
+        let (columns, geometry) = (Columns::from(&g), Geometry::new(0.0, 1.0, 1.0, 1.0));
+        // Images say that steps may be as large as they like.
+        let sensitivity = Sensitivity { name: "a".into(), growth: Growth::None, weight: 1e-9 };
+        let (coding, rows) = Coding::plan(columns, &sensitivity, &geometry, 1.0)?;
+        let coded = Coded::new(&coding, &rows, columns, &geometry, &vec![[0; 3]; count], &vec![0; count])?;
+        let restored = coded.restored();
+        Some(g.extra["a"].values.iter().zip(&restored.values).fold(0.0f32, |worst, (a, b)| worst.max((a - b).abs())))
+    }
+
+    #[test]
+    fn large_values_are_within_the_tolerance() {
+        // From 512 to 1024, neighbouring numbers are 2^-14 apart.
+        let apart = 1.0 / f32::from(1u16 << 14);
+        for (middle, tolerance) in [(0.0, 1e-3), (30.0, 1e-4), (1000.0, 2.4 * apart), (1000.0, 3.9 * apart), (1000.0, 8.9 * apart)] {
+            let found = worst(middle, tolerance).unwrap();
+            assert!(found <= tolerance && found > 0.3 * tolerance, "{found} around {middle}, {tolerance} is allowed");
+        }
+        assert!(worst(1000.0, 0.9 * apart).is_none(), "no step is small enough");
+    }
 }

@@ -282,9 +282,10 @@ impl<'a> Decoder<'a> {
         let mut reader = ByteReader::new(object, bytes);
         let mut counts = [0usize; LANES];
         for count in &mut counts {
+            // Of 32 bits, which are all that numbers of memory have on some machines, the fifth byte has four.
             for shift in (0..).step_by(7) {
                 let byte = reader.u8()?;
-                if shift > 28 {
+                if shift == 28 && byte > 0x0f {
                     return Err(reader.error("a number of words is too long"));
                 }
                 *count |= usize::from(byte & 0x7f) << shift;

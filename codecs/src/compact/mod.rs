@@ -178,8 +178,8 @@ inventory::submit! {
         info: Plugin {
             name: "compact",
             version: "4",
-            summary: "steps by what is seen, transformed colours, entropy coding: the smallest files",
-            paper: "rate-distortion allocation; octave classes; Karhunen-Loève transform; asymmetric numeral systems (constriction)",
+            summary: "the smallest files: values that show less are rounded more, colours are decorrelated, all is entropy coded",
+            paper: "rate-distortion allocation, Karhunen-Loève transform, asymmetric numeral systems (constriction)",
             schema: settings::SCHEMA,
             capabilities: &["lossy", "reorders"],
         },

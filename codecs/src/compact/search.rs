@@ -89,8 +89,8 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         let mut second = seek(job, found.attempt.quality, None, &allowance, GOOD)?;
         let coded = second.coded(job)?;
         // The corrections may be worth nothing in small models.
-        let worse = !allowance.is_of_bytes() && bytes_of(&coded) >= bytes_of(&streams);
-        if found.allowed() && (worse || !second.allowed()) {
+        let saves = allowance.is_of_bytes() || bytes_of(&coded) < bytes_of(&streams);
+        if plain_is_better(found.share, second.share, saves) {
             job.factors = plain;
             // It was good enough to be corrected.
             if found.share < GOOD {
@@ -142,6 +142,16 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     }
     report(&found, bytes_of(&streams), &allowance, start, settings, context)?;
     Ok(streams)
+}
+
+/// Whether the best attempt without corrections of the columns is better than that with them. Given are the shares of what is allowed that they use, and whether
+/// the corrections save bytes where these are not what is allowed. Of two that use too much, the better is nearer to what is allowed.
+fn plain_is_better(plain: f64, corrected: f64, saves: bool) -> bool {
+    match (plain <= 1.0, corrected <= 1.0) {
+        (true, fits) => !(fits && saves),
+        (false, true) => false,
+        (false, false) => plain <= corrected,
+    }
 }
 
 /// A factor of the steps of `attempt` with which about [`TUNED`] is lost; 1 if less is lost already.
@@ -227,4 +237,24 @@ fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settin
 
 pub fn note(context: &CodecContext, message: String) {
     context.events.emit(&Event::Note { object: "codec compact".into(), message });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::plain_is_better;
+
+    #[test]
+    fn of_two_that_use_too_much_the_nearer_is_taken() {
+        for (plain, corrected, saves, taken) in [
+            (0.9, 0.99, true, false),
+            (0.9, 0.99, false, true),
+            (0.9, 1.1, true, true),
+            (1.1, 0.9, false, false),
+            (1.05, 1.5, true, true),
+            (1.5, 1.05, false, false),
+            (f64::NAN, 1.5, true, false),
+        ] {
+            assert_eq!(plain_is_better(plain, corrected, saves), taken, "{plain} and {corrected}");
+        }
+    }
 }

@@ -258,7 +258,7 @@ inventory::submit! {
         info: Plugin {
             name: "compact",
             version: "3",
-            summary: "integers of few bits with a step per array, with a scene per row, entropy coded",
+            summary: "integers of few bits, entropy coded; one step per array, with a scene one per row of 16 values",
             paper: "uniform symmetric quantisation; asymmetric numeral systems (constriction)",
             schema: "\
 bits = 12.0              # of the largest weight of an array, 3 to 16 in quarters, before entropy coding; one less doubles the error of weights

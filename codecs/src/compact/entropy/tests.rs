@@ -96,6 +96,18 @@ fn integers_come_back_and_nothing_may_follow() {
 }
 
 #[test]
+fn numbers_of_words_have_32_bits() {
+    let (tables, _) = Tables::fit(1, &[]);
+    let refused = |bytes: &[u8]| Decoder::new("test", &tables, bytes).map(|_| ()).unwrap_err().to_string();
+    for last in [0x10, 0x8f] {
+        let message = refused(&[0x80, 0x80, 0x80, 0x80, last]);
+        assert!(message.contains("too long"), "{message}");
+    }
+    let message = refused(&[0xff, 0xff, 0xff, 0xff, 0x0f, 0, 0, 0]);
+    assert!(message.contains("bytes expected"), "{message}");
+}
+
+#[test]
 fn every_stored_distribution_is_whole() {
     for seed in 0..500u64 {
         let draw = |s: usize| cc4dgs_format::Seed::root(seed).index(s as u64).value();

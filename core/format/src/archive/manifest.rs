@@ -1,7 +1,7 @@
 //! The manifest of an archive.
 
 use super::Presentation;
-use crate::{BLUR, DeformerContext, Error, Limits, Result, Rules, Similarity};
+use crate::{BLUR, BLUR_RANGE, DeformerContext, Error, Limits, Result, Rules, Similarity};
 use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
@@ -70,6 +70,19 @@ fn is_usual(blur: &f64) -> bool {
 impl Default for RasterizerEntry {
     fn default() -> Self {
         Self { name: String::new(), rules: Rules::default(), antialiased: false, blur: BLUR, focal: None, near: None, settings: toml::Table::new() }
+    }
+}
+
+impl RasterizerEntry {
+    /// Refuses a blur, focal length or depth that nothing can be drawn with; `object` names the file in errors.
+    fn validate(&self, object: &str) -> Result<()> {
+        let problem = match (self.focal, self.near) {
+            _ if !BLUR_RANGE.contains(&self.blur) => format!("its blur of {} is not between {} and {}", self.blur, BLUR_RANGE.start(), BLUR_RANGE.end()),
+            (Some(focal), _) if !focal.is_finite() || focal <= 0.0 => format!("its longest focal length is {focal}"),
+            (_, Some(near)) if !near.is_finite() || near < 0.0 => format!("its smallest depth is {near}"),
+            _ => return Ok(()),
+        };
+        Err(damaged(object, problem))
     }
 }
 
@@ -150,13 +163,18 @@ impl Manifest {
         manifest.validate(&object, limits)?;
         Ok(manifest)
     }
-    fn validate(&self, object: &str, limits: &Limits) -> Result<()> {
+    /// Refuses what no model has; `object` names the manifest in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`] or [`Error::Limit`].
+    pub(super) fn validate(&self, object: &str, limits: &Limits) -> Result<()> {
         if self.format_version != FORMAT_VERSION {
             return Err(damaged(object, format!("format version {} differs from the file's version {FORMAT_VERSION}", self.format_version)));
         }
         limits.check_gaussians(object, self.gaussian_count)?;
         self.normalisation.validate(object)?;
         self.presentation.validate(object)?;
+        self.rasterizer.validate(object)?;
         if self.sh_degree > 4 {
             return Err(damaged(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree)));
         }
@@ -234,6 +252,25 @@ mod tests {
             Manifest { format_version: FORMAT_VERSION, frame_count: 1, deformer: Some(deformer), ..Default::default() }.validate("m", &Limits::default())
         };
         assert!(of(4, 1.0).is_ok() && of(5, 1.0).is_err() && of(usize::MAX, 1.0).is_err() && of(0, f32::INFINITY).is_err());
+    }
+
+    #[test]
+    fn what_nothing_can_be_drawn_with_is_refused() {
+        let of = |rasterizer: &RasterizerEntry| {
+            let manifest = Manifest { format_version: FORMAT_VERSION, frame_count: 1, rasterizer: rasterizer.clone(), ..Default::default() };
+            manifest.validate("m", &Limits::default())
+        };
+        let sound = RasterizerEntry { blur: *BLUR_RANGE.start(), focal: Some(1e-3), near: Some(0.0), ..Default::default() };
+        assert!(of(&sound).is_ok() && of(&RasterizerEntry::default()).is_ok());
+        for blur in [0.0, -0.3, 101.0, f64::NAN] {
+            assert!(of(&RasterizerEntry { blur, ..sound.clone() }).is_err(), "a blur of {blur}");
+        }
+        for focal in [0.0, -500.0, f64::INFINITY] {
+            assert!(of(&RasterizerEntry { focal: Some(focal), ..sound.clone() }).is_err(), "a focal length of {focal}");
+        }
+        for near in [-0.01, f32::INFINITY, f32::NAN] {
+            assert!(of(&RasterizerEntry { near: Some(near), ..sound.clone() }).is_err(), "a depth of {near}");
+        }
     }
 
     #[test]

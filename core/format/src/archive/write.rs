@@ -3,7 +3,7 @@
 use super::packing::pack;
 use super::zstandard::compress;
 use super::{FORMAT_VERSION, LARGEST_HEADER, MAGIC, MOST_STREAMS, Manifest, StreamKind};
-use crate::{Error, Result, Stream};
+use crate::{Error, Limits, Result, Stream};
 use rayon::prelude::*;
 use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
@@ -43,6 +43,7 @@ impl ArchiveWriter {
         if names.len() > MOST_STREAMS as usize {
             return Err(Error::limit("streams of an archive", names.len() as u64, u64::from(MOST_STREAMS), "Store several columns in one stream"));
         }
+        self.check_manifest()?;
         let packed = self.streams.par_iter().map(|(_, s)| pack(&s.bytes)).collect::<Result<Vec<_>>>()?;
         let manifest = self.manifest.to_json()?;
         let mut plain = Vec::with_capacity(manifest.len() + 64 * packed.len());
@@ -70,6 +71,14 @@ impl ArchiveWriter {
             out.extend(packed.bytes);
         }
         Ok(out)
+    }
+    /// Refuses a manifest that readers refuse, whatever their limits.
+    fn check_manifest(&self) -> Result<()> {
+        let limits = Limits { max_gaussians: u64::MAX, ..Limits::default() };
+        self.manifest.validate("archive manifest", &limits).map_err(|error| match error {
+            Error::Data { object, problem, .. } => Error::parameter(object, problem, "Correct the program that made it"),
+            other => other,
+        })
     }
     /// Writes the archive to `path` and returns its size in bytes. On failure `path` is unchanged.
     pub fn write_to(&self, path: impl AsRef<Path>) -> Result<u64> {
@@ -112,4 +121,23 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
         folder.sync_all().ok();
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::archive::Archive;
+
+    #[test]
+    fn what_cannot_be_read_again_is_not_written() {
+        let sound = Manifest { frame_count: 1, ..Default::default() };
+        let many = Manifest { gaussian_count: u64::MAX, ..sound.clone() };
+        assert!(ArchiveWriter::new(many).to_bytes().is_ok(), "limits are those of readers");
+        let bytes = ArchiveWriter::new(sound.clone()).to_bytes().unwrap();
+        assert!(Archive::from_bytes("t", bytes, &Limits::default()).is_ok());
+        for manifest in [Manifest { frame_count: 0, ..sound.clone() }, Manifest { sh_degree: 5, ..sound }] {
+            let error = ArchiveWriter::new(manifest).to_bytes().unwrap_err();
+            assert!(matches!(error, Error::Parameter { .. }) && error.to_string().starts_with("archive manifest: "), "{error}");
+        }
+    }
 }
