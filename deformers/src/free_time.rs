@@ -112,7 +112,7 @@ inventory::submit! {
         info: Plugin {
             name: "free-time",
             version: "1",
-            summary: "a velocity and a life per Gaussian, with a gate for what lasts",
+            summary: "a velocity and a temporal opacity per Gaussian, with a gate that keeps lasting ones visible throughout",
             paper: "FreeTimeGS; FreeTimeGS++; SharpTimeGS",
             schema: SCHEMA,
             capabilities: &["differentiable", "per-gaussian-attributes"],

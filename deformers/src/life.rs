@@ -151,7 +151,7 @@ inventory::submit! {
         info: Plugin {
             name: NAME,
             version: "1",
-            summary: "a velocity and a life per Gaussian beside any deformer, for what it cannot follow",
+            summary: "a velocity and a temporal opacity per Gaussian beside any deformer, for what appears, vanishes or is too fast for it",
             paper: "FreeTimeGS; FreeTimeGS++; SharpTimeGS",
             schema: SCHEMA,
             capabilities: &["differentiable", "per-gaussian-attributes"],

@@ -47,24 +47,24 @@ macro_rules! methods {
 families! {
     "auto", "auto", true, "chooses every setting by looking at the scene, the machine and the time there is";
     "demo", "demo", true, "the built-in ray-traced scene, minutes on two cores";
-    "n3dv", "n3dv", false, "Neural 3D Video, the paper's protocol";
-    "technicolor", "technicolor", false, "Technicolor light field, the paper's protocol";
-    "dnerf", "dnerf", false, "D-NeRF synthetic scenes at full protocol";
+    "n3dv", "n3dv", false, "Neural 3D Video, the protocol of CC-4DGS";
+    "technicolor", "technicolor", false, "Technicolor light field, the protocol of CC-4DGS";
+    "dnerf", "dnerf", false, "D-NeRF synthetic scenes at 800x800, the protocol of published tables";
     "panoptic", "panoptic", false, "PanopticSports, all frames";
 }
 
 methods! {
-    "cdf", "the paper's deformer", "CC-4DGS";
-    "swift4d", "Swift4D's joint hash grid", "Swift4D (Wu et al. 2025)";
-    "grid4d", "Grid4D's four hash grids", "Grid4D (Xu et al. 2024)";
-    "hexplane", "4DGS's planes", "4DGS (Wu et al. 2024)";
-    "embedding", "E-D3DGS's learned vectors", "E-D3DGS (Bae et al. 2024)";
-    "deform-mlp", "Deformable 3DGS's network", "Deformable 3DGS (Yang et al. 2024)";
-    "free-time", "velocities and lives of Gaussians", "FreeTimeGS; FreeTimeGS++; SharpTimeGS";
+    "cdf", "the computational deformation field of CC-4DGS", "CC-4DGS";
+    "swift4d", "Swift4D's joint hash grid over space and time", "Swift4D (Wu et al. 2025)";
+    "grid4d", "Grid4D's four hash grids over space and time", "Grid4D (Xu et al. 2024)";
+    "hexplane", "4DGS's six feature planes over space and time", "4DGS (Wu et al. 2024)";
+    "embedding", "E-D3DGS's learned vectors per Gaussian and per time", "E-D3DGS (Bae et al. 2024)";
+    "deform-mlp", "Deformable 3DGS's deep network", "Deformable 3DGS (Yang et al. 2024)";
+    "free-time", "a velocity and a temporal opacity per Gaussian", "FreeTimeGS; FreeTimeGS++; SharpTimeGS";
     "native-4d", "4D-GS's Gaussians of space and time", "4D-GS (Yang et al. 2024)";
-    "cdf-basis", "this project's deformer, linear in functions of time", "this project";
-    "hash-basis", "the same, with features of space stored in a hash grid", "this project";
-    "none", "no deformation", "Kerbl et al. 2023 (3DGS)";
+    "cdf-basis", "the computational deformation field, linear in shared functions of time: fast playback", "this project";
+    "hash-basis", "stored hash grid, linear in shared functions of time: fast training and playback", "this project";
+    "none", "no deformation: a static scene", "Kerbl et al. 2023 (3DGS)";
 }
 
 #[cfg(test)]

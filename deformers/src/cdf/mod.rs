@@ -184,7 +184,7 @@ inventory::submit! {
         info: Plugin {
             name: "cdf",
             version: "1",
-            summary: "computational deformation field: hash signatures, decoders per grid level, FiLM, trunk and five heads",
+            summary: "computational deformation field: grid features are computed from hashes by small networks, not stored; modulated by time, five heads",
             paper: "CC-4DGS, Section IV-B",
             schema: SCHEMA,
             capabilities: &["differentiable", "starts-as-identity", "vertex-reuse", "cached-spatial", "fusion=film,concat"],

@@ -141,7 +141,7 @@ inventory::submit! {
         info: Plugin {
             name: SpaceKind::Computed.name(),
             version: VERSION,
-            summary: "the coefficients of cdf-basis, from its weights",
+            summary: "plays cdf-basis without the deformer: coefficients are computed from its weights when a file is opened",
             paper: "this project",
             schema: "",
             capabilities: &[],
@@ -156,7 +156,7 @@ inventory::submit! {
         info: Plugin {
             name: SpaceKind::Stored.name(),
             version: VERSION,
-            summary: "the coefficients of hash-basis, from its weights",
+            summary: "plays hash-basis without the deformer: coefficients are computed from its weights when a file is opened",
             paper: "this project",
             schema: "",
             capabilities: &[],

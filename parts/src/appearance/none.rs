@@ -26,7 +26,7 @@ inventory::submit! {
         info: Plugin {
             name: "none",
             version: "1",
-            summary: "cameras record what is rendered",
+            summary: "no appearance model: all cameras record the rendered colours as they are",
             paper: "",
             schema: "# no settings\n",
             capabilities: &[],

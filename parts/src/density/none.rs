@@ -33,7 +33,7 @@ inventory::submit! {
         info: Plugin {
             name: "none",
             version: "1",
-            summary: "the Gaussians of the initialisation stay",
+            summary: "no density control: the initial Gaussians stay, none is added or removed",
             paper: "",
             schema: "# no settings\n",
             capabilities: &[],

@@ -29,7 +29,7 @@ inventory::submit! {
         info: Plugin {
             name: "mask-bce",
             version: "1",
-            summary: "cross-entropy of the first rendered plane as logits against a mask, for dynamic scores",
+            summary: "binary cross-entropy of rendered dynamic scores (logits) and the mask of what moves; for the score stage",
             paper: "Swift4D (Wu et al. 2025)",
             schema: "# no settings\n",
             capabilities: &["differentiable"],

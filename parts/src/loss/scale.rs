@@ -32,7 +32,7 @@ inventory::submit! {
         info: Plugin {
             name: "scale",
             version: "1",
-            summary: "mean standard deviation of the Gaussians, divided by the extent of the cameras in the normalised frame",
+            summary: "mean scale (standard deviation) of the Gaussians, relative to the extent of the cameras",
             paper: "Kheradmand et al. 2024 (3DGS-MCMC)",
             schema: "# no settings\n",
             capabilities: &["differentiable"],

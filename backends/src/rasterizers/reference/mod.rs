@@ -283,7 +283,7 @@ inventory::submit! {
         info: Plugin {
             name: "reference",
             version: "1",
-            summary: "Every pixel over every Gaussian in float64; slow, the oracle of the tests",
+            summary: "every Gaussian at every pixel in float64: slow, the reference that tests compare with",
             paper: "Kerbl et al. 2023 (3DGS); Ye et al. 2024 (gsplat)",
             schema: "# \"float64\", or \"float32\": the same formulas, rounded\nprecision = \"float64\"\n",
             capabilities: &["differentiable", "antialiased", "max-weights", "rules=gsplat099,gsplat0999,inria"],

@@ -259,7 +259,7 @@ inventory::submit! {
         info: Plugin {
             name: "mcmc",
             version: "1",
-            summary: "a budget that moves from faded Gaussians to where screen gradients are large",
+            summary: "a budget of Gaussians: faded ones are removed, and as many are split where screen gradients are large",
             paper: "3DGS-MCMC (Kheradmand et al. 2024); ImprovedGS",
             schema: SCHEMA,
             capabilities: &[],
