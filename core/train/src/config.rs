@@ -172,10 +172,6 @@ impl RunConfig {
     pub(crate) fn limits_here(&self) -> &Limits {
         self.machine_limits.as_ref().unwrap_or(&self.limits)
     }
-    /// Whether the run is to settle the length of its main stage, by the time that its plan leaves.
-    pub(crate) fn settles_length(&self) -> bool {
-        self.auto.time_left.is_some() && self.train.stretch == 1.0
-    }
     pub(crate) fn validate(&self) -> Result<()> {
         self.scene.validate()?;
         self.auto.validate()?;

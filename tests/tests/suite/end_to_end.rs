@@ -138,7 +138,7 @@ fn a_run_that_has_time_left_is_longer_and_its_settings_repeat_it() {
     let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
     assert!(bytes(&a) == bytes(&b), "the settings of a run that settled its length do not repeat it");
 
-    // Interrupted after the length was settled, and before.
+    // Interrupted after the length was settled, and before: the checkpoint says how much time was left.
     for (events_before_stop, stretch) in [(16, 4.0), (5, 1.0)] {
         let stop = AtomicBool::new(false);
         let listener = StopAfter { left: AtomicUsize::new(events_before_stop), stop: &stop };
@@ -147,7 +147,7 @@ fn a_run_that_has_time_left_is_longer_and_its_settings_repeat_it() {
         let left = RunConfig::resolve(None, Some(&c.join(CONFIG)), &[]).unwrap();
         assert_eq!(left.train.stretch, stretch);
         run(&left, &c, true, &Silent, &never).unwrap();
-        assert_eq!(bytes(&a) == bytes(&c), stretch == 4.0);
+        assert!(bytes(&a) == bytes(&c), "interrupted with a stretch of {stretch}");
     }
 }
 

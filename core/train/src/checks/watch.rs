@@ -47,11 +47,11 @@ impl Watch {
     }
     /// To be called before the first iteration of the main stage; scores the model that it begins with, where the stage has or may get the length for it.
     pub fn before_main(&mut self, context: &Context, state: &mut TrainState) -> Result<()> {
-        let (config, mut longest) = (context.job.config, context.lengths.clone());
-        if config.settles_length() {
+        let mut longest = context.lengths.clone();
+        if context.ends.is_some() {
             longest.stretch_main(MOST_STRETCH);
         }
-        if rules_of(&config.train, &longest, context.training_camera.len()) == Some(Rules::All) {
+        if rules_of(&context.job.config.train, &longest, context.training_camera.len()) == Some(Rules::All) {
             self.score(context, state, START)?;
             state.record.scores.clone_from(&self.scores);
         }

@@ -69,7 +69,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// What to train, where to, and who listens.
 pub struct TrainJob<'a> {
@@ -145,6 +145,8 @@ pub(crate) struct Context<'a> {
     pub masks: Vec<DynamicMask>,
     /// Index among the training cameras, by index in the scene.
     pub training_camera: BTreeMap<usize, usize>,
+    /// When the run is to end, where the length of its main stage follows from that and is not settled yet.
+    pub ends: Option<Instant>,
     pub checkpoint: Option<PathBuf>,
 }
 
@@ -224,6 +226,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
             TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, state::longest_focal(&job.scene), parts)
         }
     };
+    let left = config.auto.time_left.or_else(|| Duration::try_from_secs_f64(state.record.seconds_left?).ok());
     let mut context = Context {
         job,
         settings: config.clone(),
@@ -237,6 +240,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         seed,
         masks,
         training_camera,
+        ends: left.filter(|_| config.train.stretch == 1.0).and_then(|left| began.checked_add(left)),
         checkpoint,
     };
 
@@ -246,7 +250,6 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.views_per_iteration(stage)));
     }
     let mut watch = Watch::new(&context, doubts, &state)?;
-    let ends = config.auto.time_left.and_then(|left| began.checked_add(left));
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
@@ -257,13 +260,14 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         if stage == Stage::Score && matches!(moving, Moving::Scored { .. }) && context.masks.is_empty() && context.lengths.length(stage) > 0 {
             context.masks = context.residual_masks(&mut state)?;
         }
-        context.run_stage(stage, &mut state, &mut watch, ends)?;
+        context.run_stage(stage, &mut state, &mut watch)?;
         stage_seconds.insert(stage.name().to_string(), stage_began.elapsed().as_secs_f64());
         if stage != Stage::Main {
             state.stage = Stage::ALL[stage as usize + 1];
             state.iteration = 0;
         }
     }
+    context.ends = None;
     context.save(&mut state)?;
     let verdict = watch.conclude(&context, &mut state)?;
     let dynamic_gaussians = state.moving_rows(&context.device)?.count();

@@ -49,9 +49,9 @@ pub(super) struct Pace {
 }
 
 impl Pace {
-    /// For a stage that begins, in a run that is to end at `ends`; `None` where no time was planned or the length is settled.
-    pub fn new(context: &Context, stage: Stage, state: &TrainState, ends: Option<Instant>) -> Option<Self> {
-        let ends = ends.filter(|_| stage == Stage::Main && state.iteration == 0 && context.job.config.settles_length())?;
+    /// For a stage that begins or goes on; `None` where no time was planned or the length is settled.
+    pub fn new(context: &Context, stage: Stage, state: &TrainState) -> Option<Self> {
+        let ends = context.ends.filter(|_| stage == Stage::Main && state.iteration < context.lengths.settles_at())?;
         Some(Self { ends, since: None, seconds: Vec::new() })
     }
     /// To be called after every iteration: the factor by which the main stage is to be stretched, once it is known.

@@ -13,6 +13,9 @@ pub struct Record {
     /// What the watchdog did in the stage under way; at its default between stages.
     #[serde(skip_serializing_if = "Attempts::is_none")]
     pub(crate) attempts: Attempts,
+    /// Seconds of the planned time that were left, where the length of the main stage was not settled yet.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) seconds_left: Option<f64>,
 }
 
 /// What the watchdog did in a stage. Absent from the checkpoints of older versions and of runs without trouble.

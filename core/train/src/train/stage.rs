@@ -17,7 +17,7 @@ use std::time::Instant;
 
 impl Context<'_> {
     /// Runs `stage` from where `state` stands to its end. `ends` is when the run is to end, where that was planned.
-    pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch, ends: Option<Instant>) -> Result<()> {
+    pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
         let events = self.job.events;
         if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
             if stage == Stage::Main {
@@ -42,7 +42,7 @@ impl Context<'_> {
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
         let began = Instant::now();
         let mut sampler = self.sampler(&first);
-        let mut pace = Pace::new(self, stage, state, ends);
+        let mut pace = Pace::new(self, stage, state);
         let prefetcher = Prefetcher::new();
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
@@ -89,9 +89,12 @@ impl Context<'_> {
                 // Back at an earlier state.
                 continue;
             }
-            if let Some(factor) = pace.as_mut().and_then(|pace| pace.after_iteration(self, &schedule, state.set.len())) {
-                pace = None;
-                self.stretch_main(factor)?;
+            if let Some(timed) = &mut pace {
+                let factor = timed.after_iteration(self, &schedule, state.set.len());
+                if schedule.iteration >= self.lengths.settles_at() {
+                    (pace, self.ends) = (None, None);
+                }
+                factor.map_or(Ok(()), |factor| self.stretch_main(factor))?;
             }
             if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
                 state.record.log = log.record();
@@ -184,6 +187,7 @@ impl Context<'_> {
     pub(super) fn save(&self, state: &mut TrainState) -> Result<()> {
         self.remove_broken(state)?;
         let Some(path) = &self.checkpoint else { return Ok(()) };
+        state.record.seconds_left = self.ends.map(|ends| ends.saturating_duration_since(Instant::now()).as_secs_f64());
         let bytes = checkpoint::save(path, state, &self.settings)?;
         self.job.events.emit(&Event::Saved { path: path.display().to_string(), bytes });
         Ok(())

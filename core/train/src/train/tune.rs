@@ -154,6 +154,7 @@ impl<'a> Tuner<'a> {
             seed,
             masks: Vec::new(),
             training_camera,
+            ends: None,
             checkpoint: None,
         };
         let of = self.job.model;
