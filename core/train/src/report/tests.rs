@@ -145,16 +145,18 @@ fn the_best_of_a_column_is_one_of_several_that_did_not_fail() {
     assert!(bold(&[0, 2, 6], &unscored).is_empty(), "only one has a mean");
 }
 
+/// The figure `name` of a report of `cells`, without images; `None` where there is none.
+fn figure(folder: &Path, cells: &[CellResult], name: &str) -> Option<String> {
+    write(folder, cells);
+    let figures = report(folder, &ReportOptions { images: ImageChoice::None, ..Default::default() }).unwrap().figures;
+    figures.into_iter().find(|(other, _)| other == name).map(|(_, svg)| svg)
+}
+
 #[test]
 fn trainings_that_failed_are_not_on_the_pareto_front() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());
-    let options = ReportOptions { images: ImageChoice::None, ..Default::default() };
-    let plot = |cells: &[CellResult]| {
-        write(folder.path(), cells);
-        let figures = report(folder.path(), &options).unwrap().figures;
-        figures.into_iter().find(|(name, _)| name == "tiny-psnr-against-size.svg").unwrap().1
-    };
+    let plot = |cells: &[CellResult]| figure(folder.path(), cells, "tiny-psnr-against-size.svg").unwrap();
     let rings = |plot: &str| plot.matches("class=\"onfront\"").count();
     let sound = plot(&cells);
     assert_eq!((rings(&sound), sound.contains("(failed)")), (3, false), "all but cdf with cca-default: hexplane with cca-low is smaller and better");
@@ -168,18 +170,13 @@ fn trainings_that_failed_are_not_on_the_pareto_front() {
 fn scores_of_validation_views_are_drawn_where_there_are_some() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());
-    let options = ReportOptions { images: ImageChoice::None, ..Default::default() };
-    let plot = |cells: &[CellResult]| {
-        write(folder.path(), cells);
-        let figures = report(folder.path(), &options).unwrap().figures;
-        figures.into_iter().find(|(name, _)| name == "tiny-validation-views-by-time-a-line-per-seed.svg")
-    };
+    let plot = |cells: &[CellResult]| figure(folder.path(), cells, "tiny-validation-views-by-time-a-line-per-seed.svg");
     assert!(plot(&cells).is_none());
     for cell in cells.iter_mut().filter(|c| c.axes.method == "cdf") {
         (cell.validation_curve.iteration, cell.validation_curve.psnr_db) = (vec![130, 2600], vec![20.0, 30.0]);
         cell.cost.validation_seconds = vec![60.0, 120.0];
     }
-    let (_, svg) = plot(&cells).unwrap();
+    let svg = plot(&cells).unwrap();
     assert_eq!(svg.matches("class=\"line\"").count(), 2, "a line per seed, once for both codecs");
     assert!(svg.contains("cdf</text>") && !svg.contains("hexplane</text>"), "{svg}");
     // Trainings that keep other numbers of views out are scored on other views.
@@ -188,13 +185,13 @@ fn scores_of_validation_views_are_drawn_where_there_are_some() {
         cell.cost.validation_seconds = vec![60.0, 120.0];
         cell.provenance.configuration["train"]["validation"] = 12.into();
     }
-    assert!(!plot(&cells).unwrap().1.contains("train.validation"));
+    assert!(!plot(&cells).unwrap().contains("train.validation"));
     cells.iter_mut().filter(|c| c.axes.method == "cdf").for_each(|c| c.provenance.configuration["train"]["validation"] = 3.into());
-    let (_, svg) = plot(&cells).unwrap();
+    let svg = plot(&cells).unwrap();
     assert!(svg.contains("train.validation") && svg.contains("cdf 3; hexplane 12."), "{svg}");
     cells[0].validation_curve.psnr_db[1] = 1e300;
     write(folder.path(), &cells);
-    assert!(report(folder.path(), &options).unwrap_err().to_string().contains("validation_curve"));
+    assert!(report(folder.path(), &ReportOptions::default()).unwrap_err().to_string().contains("validation_curve"));
 }
 
 #[test]
