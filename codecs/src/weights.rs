@@ -119,7 +119,7 @@ impl WeightCodec for Precision {
     fn loss(&self) -> f64 {
         match self {
             Self::Fp32 => 0.0,
-            // The rounding of an 11-bit significand.
+            // The rounding of an 11-bit significand. Values below 2^-14 are rounded to multiples of 2^-24, which is no more beside a largest value from 2^-14 on.
             Self::Fp16 => 1.0 / 2048.0,
             // Half a step, plus the rounding of the scale.
             Self::Int8 => 0.5 / 127.0 + 1e-5,
@@ -206,6 +206,25 @@ mod tests {
         assert!(Precision::Int8.read(&mut ByteReader::new("w", &bytes), 1).unwrap()[0].is_finite());
         let error = Precision::Int8.write("w", &[1.0, -f32::MAX], &mut Vec::new()).unwrap_err().to_string();
         assert!(error.contains("weights 'w': 3.4028235e38 is over the limit of int8"), "{error}");
+    }
+
+    #[test]
+    fn fp16_loses_little_beside_a_largest_value_of_full_precision() {
+        let stored = |values: &[f32]| {
+            let mut bytes = Vec::new();
+            Precision::Fp16.write("w", values, &mut bytes).unwrap();
+            Precision::Fp16.read(&mut ByteReader::new("w", &bytes), values.len()).unwrap()
+        };
+        let least = f16::MIN_POSITIVE.to_f32();
+        for largest in [least, 1.37 * least, 1.0, 65504.0] {
+            let values: Vec<f32> = std::iter::once(largest).chain((0..2000).map(|k| largest * 0.98f32.powi(k))).collect();
+            let found = stored(&values);
+            let worst = values.iter().zip(&found).map(|(a, b)| f64::from(a - b).abs()).fold(0.0, f64::max);
+            assert!(worst <= Precision::Fp16.loss() * f64::from(largest), "{worst:e} beside {largest:e}");
+        }
+        // As documented, an array may become zero where all of it is smaller.
+        assert_eq!(stored(&[2.9e-8, -2.9e-8]), [0.0; 2]);
+        assert!(stored(&[3.1e-8]) != [0.0]);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::storage::Shape;
 use cc4dgs_format::{ExtraAttribute, HostGaussians};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// The columns of [`HostGaussians`], each of which may be that of others.
@@ -103,9 +104,9 @@ impl<'a> Rows<'a> {
 }
 
 /// The rows `[N,width]` of `values` in another order.
-pub fn sorted<T: Copy>(values: Vec<T>, width: usize, order: &[usize]) -> Vec<T> {
-    let mut out = Vec::with_capacity(order.len() * width);
-    order.iter().for_each(|&i| out.extend_from_slice(&values[i * width..(i + 1) * width]));
+pub fn sorted<T: Copy + Default + Send + Sync>(values: Vec<T>, width: usize, order: &[usize]) -> Vec<T> {
+    let mut out = vec![T::default(); order.len() * width];
+    out.par_chunks_exact_mut(width).zip(order).for_each(|(row, &i)| row.copy_from_slice(&values[i * width..(i + 1) * width]));
     out
 }
 

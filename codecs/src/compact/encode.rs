@@ -109,7 +109,7 @@ pub fn classify(colors: &[f64], shapes: &[f64], adaptive: bool) -> Classes {
 /// Octaves of each weight below the top one.
 fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) {
     let mut sorted: Vec<f64> = weights.iter().copied().filter(|w| *w > 0.0 && w.is_finite()).collect();
-    sorted.sort_unstable_by(f64::total_cmp);
+    sorted.par_sort_unstable_by(f64::total_cmp);
     if sorted.is_empty() {
         return (vec![0; weights.len()], 1.0);
     }
@@ -143,19 +143,29 @@ impl Plan {
     fn rounds_alike(&self, other: &Self, degree: usize) -> bool {
         self.degrees.get(degree) == other.degrees.get(degree) && self.rounds_degree(degree) == other.rounds_degree(degree)
     }
+    /// The directions for which colours are rounded together, of those that there are.
+    fn together<'a>(&self, directions: Option<&'a Directions>) -> Option<&'a Directions> {
+        directions.filter(|_| self.joint)
+    }
+    /// Whether the coefficients of each degree have the codes that they have with `before`, a plan of the same planner, and so lose as much.
+    pub fn keeps_colors(&self, before: &Self, directions: Option<&Directions>) -> Vec<bool> {
+        let together = self.together(directions).is_some();
+        let mut keeps: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds_alike(before, degree)).collect();
+        // Together, a degree makes up for the errors of those above it.
+        if before.together(directions).is_some() != together || together && keeps.contains(&false) {
+            keeps.fill(false);
+        }
+        keeps
+    }
     /// The codes of the colours of canonical Gaussians, by degree. With `directions`, colours are rounded together if they may be. `before` are the codes of
     /// the same Gaussians with another plan of the same planner: they are taken for degrees that are rounded alike.
     pub fn color_codes(&self, gaussians: Columns, classes: &Classes, directions: Option<&Directions>, before: Option<(Self, Vec<Codes>)>) -> Vec<Codes> {
-        let directions_of = |plan: &Self| directions.filter(|_| plan.joint);
-        let together = directions_of(self);
         let mut known: Vec<Option<Codes>> = self.degrees.iter().map(|_| None).collect();
-        if let Some((plan, codes)) = before.filter(|(plan, _)| directions_of(plan).is_some() == together.is_some()) {
-            let alike = |(degree, codes): (usize, Codes)| Some(codes).filter(|_| self.rounds_alike(&plan, degree));
-            known = codes.into_iter().enumerate().map(alike).collect();
+        if let Some((plan, codes)) = before {
+            known = codes.into_iter().zip(self.keeps_colors(&plan, directions)).map(|(codes, keeps)| Some(codes).filter(|_| keeps)).collect();
         }
         let exact = |dims: usize| Codes::none(gaussians.len(), dims);
-        if let Some(directions) = together.filter(|_| known.iter().any(Option::is_none)) {
-            // A degree makes up for the errors of those above it.
+        if let Some(directions) = self.together(directions).filter(|_| known.iter().any(Option::is_none)) {
             drop(known);
             let rounds: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds_degree(degree)).collect();
             let choices: Vec<Choices> = (0..self.degrees.len()).map(|degree| self.choices_of(degree)).collect();
@@ -243,10 +253,12 @@ mod tests {
             codes.iter_mut().for_each(|codes| codes.values[0] += 1000);
             let wanted: Vec<i32> = codes.iter().map(|codes| codes.values[0]).collect();
             let next = plan(largest, joint);
+            let keeps = next.keeps_colors(&before, directions);
             let found = next.color_codes(columns, &classes, directions, Some((before, codes)));
             let afresh = next.color_codes(columns, &classes, directions, None);
             let kept: Vec<bool> = found.iter().zip(wanted).map(|(found, wanted)| found.values[0] == wanted).collect();
             assert!(kept.iter().zip(found.iter().zip(&afresh)).all(|(kept, (found, afresh))| *kept || found == afresh));
+            assert_eq!(keeps, kept);
             kept
         };
         assert_eq!(kept(None, centres, true), [true; 3]);

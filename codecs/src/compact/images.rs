@@ -1,6 +1,38 @@
-//! How much images change with the Gaussians that are drawn.
+//! How much images change with the Gaussians that are drawn, and how much they differ from those that were recorded.
 
 use cc4dgs_format::{Camera, HostGaussians, RenderModel, Result, TrainingViews};
+
+/// Some evenly spaced views, and the images that were recorded there: a search compares many models with them.
+pub struct Recorded<'a> {
+    views: Vec<(&'a Camera, f32)>,
+    renderer: &'a dyn RenderModel,
+    /// Colours `[3,H,W]` of each view.
+    truths: Vec<Vec<f32>>,
+    /// What the views are called in messages.
+    pub kind: &'static str,
+}
+
+impl<'a> Recorded<'a> {
+    /// The images of `chosen` of the views, which must have so many.
+    pub fn of(views: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize) -> Result<Self> {
+        let index = |k: usize| k * views.len() / chosen;
+        let truths = (0..chosen).map(|k| Ok(views.image(index(k))?.to_planes(renderer.background()))).collect::<Result<Vec<_>>>()?;
+        Ok(Self { views: (0..chosen).map(|k| views.view(index(k))).collect(), renderer, truths, kind: views.kind() })
+    }
+    /// The number of views.
+    pub fn len(&self) -> usize {
+        self.views.len()
+    }
+    /// The mean PSNR of `gaussians` in dB ([`cc4dgs_format::psnr_on_views`]).
+    pub fn psnr(&self, gaussians: &HostGaussians) -> Result<f64> {
+        let mut sum = 0.0;
+        self.renderer.render_views(gaussians, &self.views, &mut |k, drawn| {
+            sum += drawn.psnr(&self.truths[k]);
+            Ok(())
+        })?;
+        Ok(sum / self.views.len().max(1) as f64)
+    }
+}
 
 /// Some evenly spaced views, and the images of the original Gaussians in them.
 pub struct Images<'a> {

@@ -5,7 +5,8 @@
 
 use super::joint::Directions;
 use super::sensitivity::Sensitivity;
-use cc4dgs_format::{BLUR, CodecContext, Event, HostGaussians, Result};
+use cc4dgs_format::{BLUR, Camera, CodecContext, Event, HostGaussians, Result};
+use rayon::prelude::*;
 use std::ops::RangeInclusive;
 
 /// Value of the spherical-harmonics basis function of degree 0.
@@ -88,7 +89,7 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
         // A Gaussian that fills the image is not seen beyond it.
         SH0 * SEEN * alpha * (std::f64::consts::PI * area).min(samples).sqrt()
     };
-    let weights: Vec<f64> = (0..gaussians.len()).map(weight).collect();
+    let weights: Vec<f64> = (0..gaussians.len()).into_par_iter().map(weight).collect();
     Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default(), attributes: Vec::new(), directions: None }
 }
 
@@ -102,36 +103,43 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool, j
     }
     let mut total: Option<HostGaussians> = None;
     let mut directions = (joint && gaussians.sh_degree > 0).then(|| Directions::new(gaussians.len(), gaussians.sh_degree));
-    for k in 0..chosen {
-        let (camera, time_norm) = views.view(k * views.len() / chosen);
-        let Some(found) = renderer.squared_derivatives(gaussians, camera, time_norm, context.seed.child("importance").index(k as u64))? else {
-            return Ok(None);
-        };
+    let shown: Vec<(&Camera, f32)> = (0..chosen).map(|k| views.view(k * views.len() / chosen)).collect();
+    let measured = renderer.squared_derivatives_in_views(gaussians, &shown, context.seed.child("importance"), &mut |k, found, means| {
         if let Some(directions) = &mut directions {
+            let (camera, time_norm) = shown[k];
             let weights: Vec<f64> =
-                found.sh_dc.chunks_exact(3).map(|v| v.iter().map(|&v| f64::from(v)).sum::<f64>() / (3.0 * SH0 * SH0 * chosen as f64)).collect();
-            let moved = context.deformer.map(|deformer| deformer.deform(gaussians, time_norm)).transpose()?;
-            directions.add(camera, &moved.as_ref().unwrap_or(gaussians).means, &weights);
+                found.sh_dc.par_chunks_exact(3).map(|v| v.iter().map(|&v| f64::from(v)).sum::<f64>() / (3.0 * SH0 * SH0 * chosen as f64)).collect();
+            let moved = match (means, context.deformer) {
+                (None, Some(deformer)) => Some(deformer.deform(gaussians, time_norm)?.means),
+                (means, _) => means,
+            };
+            directions.add(camera, moved.as_ref().unwrap_or(&gaussians.means), &weights);
         }
         match &mut total {
             None => total = Some(found),
             Some(total) => {
                 for ((_, _, sum), (_, _, found)) in total.columns_mut().into_iter().zip(found.columns()) {
-                    sum.iter_mut().zip(found).for_each(|(s, f)| *s += f);
+                    sum.par_iter_mut().zip(found).for_each(|(s, f)| *s += f);
                 }
             }
         }
         context.events.emit(&Event::Progress { task: "importance of Gaussians".into(), done: k as u64 + 1, total: chosen as u64 });
+        Ok(())
+    })?;
+    if !measured {
+        return Ok(None);
     }
     let Some(total) = total else { return Ok(None) };
     let row = |values: &[f32], width: usize, i: usize| values[i * width..(i + 1) * width].iter().map(|&v| f64::from(v)).sum::<f64>();
     let n = gaussians.len();
-    let colours: Vec<f64> = (0..n).map(|i| row(&total.sh_dc, 3, i) / 3.0).collect();
+    // Values of rows by themselves; sums over rows have a fixed order.
+    let each = |weight: &(dyn Fn(usize) -> f64 + Sync)| (0..n).into_par_iter().map(weight).collect::<Vec<f64>>();
+    let colours = each(&|i| row(&total.sh_dc, 3, i) / 3.0);
     let floor = LEAST * median(&colours).max(f64::MIN_POSITIVE);
     // With the steps of each Gaussian in proportion to the inverse of `of`, the ratio of steps that is best is the inverse root of the mean ratio of weights.
-    let mean = |weight: &dyn Fn(usize) -> f64, of: &[f64]| (0..n).map(|i| weight(i) / of[i].max(floor)).sum::<f64>() / n as f64;
-    let ratio = |weight: &dyn Fn(usize) -> f64, of: &[f64]| {
-        let mean = mean(weight, of);
+    let mean = |weights: &[f64], of: &[f64]| weights.iter().zip(of).map(|(weight, of)| weight / of.max(floor)).sum::<f64>() / n as f64;
+    let ratio = |weights: &[f64], of: &[f64]| {
+        let mean = mean(weights, of);
         if mean > 0.0 && mean.is_finite() { (1.0 / mean).sqrt().clamp(1e-3, 1e3) } else { 1.0 }
     };
     let width = 3 * cc4dgs_format::gaussians::sh_rest_len(gaussians.sh_degree);
@@ -140,26 +148,26 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool, j
         if d > gaussians.sh_degree {
             1.0
         } else {
-            ratio(&|i| row(&total.sh_rest[i * width + from..i * width + to], to - from, 0) / (to - from) as f64, &colours)
+            ratio(&each(&|i| row(&total.sh_rest[i * width + from..i * width + to], to - from, 0) / (to - from) as f64), &colours)
         }
     };
-    let means = |i: usize| row(&total.means, 3, i) / 3.0 * sizes(&gaussians.log_scales[3 * i..3 * i + 3]).0.powi(2);
-    let log_scales = |i: usize| row(&total.log_scales, 3, i) / 3.0;
-    let quaternions = |i: usize| {
+    let means = each(&|i| row(&total.means, 3, i) / 3.0 * sizes(&gaussians.log_scales[3 * i..3 * i + 3]).0.powi(2));
+    let log_scales = each(&|i| row(&total.log_scales, 3, i) / 3.0);
+    let quaternions = each(&|i| {
         let q = &gaussians.quaternions[4 * i..4 * i + 4];
         let norm: f64 = q.iter().map(|&v| f64::from(v).powi(2)).sum();
         let s = &gaussians.log_scales[3 * i..3 * i + 3];
         let octaves = f64::from(s.iter().copied().fold(f32::MIN, f32::max) - s.iter().copied().fold(f32::MAX, f32::min)) / std::f64::consts::LN_2;
         let finer = [0.25, 2.0, 4.0, 8.0][(octaves + 0.5).clamp(0.0, 3.0) as usize];
         row(&total.quaternions, 4, i) / 3.0 * norm / (finer * finer)
-    };
-    let opacity_logits = |i: usize| f64::from(total.opacity_logits[i]) * (1.0 + f64::from(gaussians.opacity_logits[i]).max(0.0)).powi(2);
+    });
+    let opacity_logits = each(&|i| f64::from(total.opacity_logits[i]) * (1.0 + f64::from(gaussians.opacity_logits[i]).max(0.0)).powi(2));
     // Weights of shapes are the mean of those of their attributes, each with the same mean ratio to those of colours.
     let mut shapes = vec![0.0; if apart { n } else { 0 }];
-    for weight in [&means as &dyn Fn(usize) -> f64, &log_scales, &quaternions, &opacity_logits] {
-        let mean = mean(weight, &colours);
+    for weights in [&means, &log_scales, &quaternions, &opacity_logits] {
+        let mean = mean(weights, &colours);
         if mean > 0.0 && mean.is_finite() {
-            shapes.iter_mut().enumerate().for_each(|(i, shape)| *shape += weight(i) / mean);
+            shapes.iter_mut().zip(weights).for_each(|(shape, weight)| *shape += weight / mean);
         }
     }
     if shapes.is_empty() {
@@ -196,7 +204,8 @@ fn pixel_scales(gaussians: &HostGaussians, context: &CodecContext) -> (Vec<f64>,
     let cameras: Vec<_> = (0..chosen).map(|k| views.view(k * views.len() / chosen).0).collect();
     let samples = cameras.iter().map(|c| 3.0 * f64::from(c.width) * f64::from(c.height)).sum::<f64>() / chosen as f64;
     let depth = |m: &[[f64; 4]; 4], mean: &[f32]| (0..3).map(|c| m[2][c] * f64::from(mean[c])).sum::<f64>() + m[2][3];
-    let farthest = cameras.iter().flat_map(|c| gaussians.means.chunks_exact(3).map(|mean| depth(&c.world_to_camera, mean))).fold(0.0, f64::max);
+    let farthest_of = |mean: &[f32]| cameras.iter().map(|c| depth(&c.world_to_camera, mean)).fold(0.0, f64::max);
+    let farthest = gaussians.means.par_chunks_exact(3).map(farthest_of).reduce(|| 0.0, f64::max);
     // Models may be of any size.
     let near = NEAR.min(0.1 * farthest);
     let scale = |mean: &[f32]| {
@@ -212,7 +221,7 @@ fn pixel_scales(gaussians: &HostGaussians, context: &CodecContext) -> (Vec<f64>,
         }
         if count > 0.0 { (sum / count).sqrt() } else { 0.0 }
     };
-    (gaussians.means.chunks_exact(3).map(scale).collect(), samples)
+    (gaussians.means.par_chunks_exact(3).map(scale).collect(), samples)
 }
 
 /// Pixels per world unit of a camera that sees most of the model.
@@ -225,7 +234,9 @@ fn whole(gaussians: &HostGaussians) -> f64 {
 }
 
 pub fn median(values: &[f64]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_unstable_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
+    if values.is_empty() {
+        return 0.0;
+    }
+    let (middle, mut values) = (values.len() / 2, values.to_vec());
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

@@ -56,7 +56,7 @@ impl Job<'_> {
     /// Rounds the Gaussians to encode; with what they will be decoded to ([`Job::restored`]).
     pub fn attempt(&self, quality: f64) -> Result<(Attempt, HostGaussians)> {
         let gaussians = self.planner.gaussians;
-        self.attempt_with(&self.planner, quality, &self.factors, |of| Ok(in_order(&of, gaussians, &self.order(&of))))
+        self.attempt_with(&self.planner, quality, &self.factors, |of| Ok(restored(&of, gaussians, Some(&self.order(&of)))))
     }
     /// Rounds the Gaussians of `planner` and codes them.
     pub fn coded(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<(Attempt, Vec<Stream>)> {
@@ -73,13 +73,22 @@ impl Job<'_> {
     /// Rounds the Gaussians of `planner` in steps that keep the declared loss; `work` gets their integers.
     fn attempt_with<T>(&self, planner: &Planner, quality: f64, factors: &Factors, work: impl FnOnce(Integers) -> Result<T>) -> Result<(Attempt, T)> {
         let joint = self.joint.get();
-        let (mut bounds, mut before) = (Bounds { joint, ..Bounds::NONE }, None);
+        let (mut bounds, mut before, mut lost) = (Bounds { joint, ..Bounds::NONE }, None, Vec::<f64>::new());
         // Colours may be rounded apart, and each column be stored exactly in the end.
         for reductions in 0..REDUCTIONS + 2 + factors.len() {
             let plan = planner.plan(quality, factors, &bounds);
+            // Colours that keep their codes lose what they lost.
+            let keeps = before.as_ref().map(|(before, _): &(Plan, Vec<Codes>)| plan.keeps_colors(before, self.directions)).unwrap_or_default();
+            let known = |column: usize| match column {
+                4 => keeps.first() == Some(&true),
+                5 => keeps.len() > 1 && !keeps[1..].contains(&false),
+                _ => false,
+            };
+            let known = std::array::from_fn(|column| lost.get(column).copied().filter(|_| known(column)));
             let of = self.quantise(planner.gaussians, &plan, before.take());
             let (together, mut kept) = (bounds.joint && self.directions.is_some(), true);
-            for ((&(name, allowed), lost), factor) in LOSSES.iter().zip(losses(&of, planner.gaussians, planner.rest)).zip(&mut bounds.largest) {
+            lost = losses(&of, planner.gaussians, &planner.losses, known);
+            for ((&(name, allowed), &lost), factor) in LOSSES.iter().zip(&lost).zip(&mut bounds.largest) {
                 // A small part of it is left for what rounding adds.
                 if lost.is_nan() || lost > 0.999 * allowed {
                     kept = false;
@@ -123,7 +132,7 @@ impl Job<'_> {
     /// are stored as their plug-ins allow, are the originals.
     pub fn restored(&self, gaussians: Columns, plan: &Plan) -> HostGaussians {
         let of = self.quantise(gaussians, plan, None);
-        in_order(&of, gaussians, &self.order(&of))
+        restored(&of, gaussians, Some(&self.order(&of)))
     }
     /// [`Job::streams`] and [`Job::restored`].
     pub fn stored(&self, gaussians: Columns, plan: &Plan) -> Result<(Vec<Stream>, HostGaussians)> {
@@ -131,7 +140,7 @@ impl Job<'_> {
     }
     fn written_and_restored(&self, gaussians: Columns, of: Integers) -> Result<(Vec<Stream>, HostGaussians)> {
         let order = self.order(&of);
-        let rounded = in_order(&of, gaussians, &order);
+        let rounded = restored(&of, gaussians, Some(&order));
         Ok((self.write(gaussians, of, &order)?, rounded))
     }
     /// The streams of `gaussians`, whose integers are `of`, in their [`Job::order`].
@@ -142,13 +151,9 @@ impl Job<'_> {
     }
     /// The order in which rows are stored.
     pub fn order(&self, of: &Integers) -> Vec<usize> {
-        let (mut order, layers): (Vec<usize>, _) = ((0..of.keys.len()).collect(), &self.layers.0);
-        order.par_sort_unstable_by_key(|&i| (layers[i], of.keys[i], i));
-        order
+        // Rows beside their keys, so that sorting reads no others.
+        let mut rows: Vec<(u8, u64, u32)> = self.layers.0.iter().zip(&of.keys).enumerate().map(|(row, (&layer, &key))| (layer, key, row as u32)).collect();
+        rows.par_sort_unstable();
+        rows.into_iter().map(|(_, _, row)| row as usize).collect()
     }
-}
-
-/// What the integers of `given` stand for, in this order.
-fn in_order(of: &Integers, given: Columns, order: &[usize]) -> HostGaussians {
-    restored(of, given).into_selected(order)
 }

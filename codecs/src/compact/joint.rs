@@ -101,18 +101,24 @@ impl Directions {
     /// Codes of all `degrees` of `gaussians`, which are as many as views were added for. A degree that `rounds` says is not rounded is stored exactly, as are rows that
     /// are out of range.
     pub fn quantise(&self, degrees: &[Degree], gaussians: Columns, classes: &[u8], rounds: &[bool], choices: &[Choices]) -> Vec<Codes> {
-        let starts: Vec<usize> = (0..classes.len()).step_by(CHUNK).collect();
-        let chunk = |first: usize| self.quantise_rows(degrees, gaussians, classes, rounds, choices, first..classes.len().min(first + CHUNK));
-        let chunks: Vec<Vec<Codes>> = starts.into_par_iter().map(chunk).collect();
-        let whole = |plan: &Degree| Codes { values: Vec::with_capacity(classes.len() * plan.dims), missing: Vec::new() };
-        let mut out: Vec<Codes> = degrees.iter().map(whole).collect();
-        for (k, chunk) in chunks.into_iter().enumerate() {
-            for (all, rows) in out.iter_mut().zip(chunk) {
-                all.values.extend(rows.values);
-                all.missing.extend(rows.missing.into_iter().map(|row| k * CHUNK + row));
-            }
+        let mut values: Vec<Vec<i32>> = degrees.iter().map(|plan| vec![0; classes.len() * plan.dims]).collect();
+        // The values of each chunk, by degree.
+        let mut parts: Vec<Vec<&mut [i32]>> = (0..classes.len().div_ceil(CHUNK)).map(|_| Vec::with_capacity(degrees.len())).collect();
+        for (values, plan) in values.iter_mut().zip(degrees) {
+            parts.iter_mut().zip(values.chunks_mut(CHUNK * plan.dims)).for_each(|(parts, part)| parts.push(part));
         }
-        out
+        let chunk = |(k, parts): (usize, Vec<&mut [i32]>)| -> Vec<Vec<usize>> {
+            let first = k * CHUNK;
+            let found = self.quantise_rows(degrees, gaussians, classes, rounds, choices, first..classes.len().min(first + CHUNK));
+            let put = |(part, codes): (&mut [i32], Codes)| -> Vec<usize> {
+                part.copy_from_slice(&codes.values);
+                codes.missing.into_iter().map(|row| first + row).collect()
+            };
+            parts.into_iter().zip(found).map(put).collect()
+        };
+        let missing: Vec<Vec<Vec<usize>>> = parts.into_par_iter().enumerate().map(chunk).collect();
+        let of_degree = |degree: usize| missing.iter().flat_map(|chunk| &chunk[degree]).copied().collect();
+        values.into_iter().enumerate().map(|(degree, values)| Codes { values, missing: of_degree(degree) }).collect()
     }
     /// The same of some `rows` of all.
     fn quantise_rows(&self, degrees: &[Degree], gaussians: Columns, classes: &[u8], rounds: &[bool], choices: &[Choices], rows: Range<usize>) -> Vec<Codes> {
@@ -122,7 +128,8 @@ impl Directions {
         let mut out = Vec::with_capacity(degrees.len());
         for (degree, plan) in degrees.iter().enumerate().rev() {
             let (dims, first, given) = (plan.dims, degree * degree, gaussians.coefficients(degree));
-            let mut wanted: Vec<f32> = rows.clone().flat_map(|row| given.row(row)).copied().collect();
+            let mut wanted: Vec<f32> = Vec::with_capacity(rows.len() * dims);
+            rows.clone().for_each(|row| wanted.extend_from_slice(given.row(row)));
             for ((wanted, errors), triangle) in wanted.chunks_exact_mut(dims).zip(&errors).zip(triangles.chunks_exact(start(self.functions))) {
                 for (channel, errors) in errors.iter().enumerate() {
                     let shifts = compensation(triangle, self.functions, first..first + dims / CHANNELS, errors);

@@ -3,6 +3,7 @@
 use super::attributes::CODED;
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::{Result, StreamStage};
+use rayon::prelude::*;
 use std::ops::Range;
 
 /// Layers that a file may have.
@@ -24,7 +25,7 @@ pub fn number(wanted: usize, count: usize) -> usize {
 /// The layer of each Gaussian, and how many each has. The last has the half with the smallest weights, the one before the next quarter, and so on.
 pub fn assign(weights: &[f64], number: usize) -> (Vec<u8>, Vec<usize>) {
     let mut order: Vec<usize> = (0..weights.len()).collect();
-    order.sort_by(|&a, &b| weights[b].total_cmp(&weights[a]).then(a.cmp(&b)));
+    order.par_sort_unstable_by(|&a, &b| weights[b].total_cmp(&weights[a]).then(a.cmp(&b)));
     let (mut out, sizes) = (vec![0; weights.len()], sizes_of(weights.len(), number));
     for (layer, rows) in ranges(&sizes).into_iter().enumerate() {
         order[rows].iter().for_each(|&i| out[i] = layer as u8);

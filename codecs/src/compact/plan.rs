@@ -6,7 +6,7 @@ use super::columns::Columns;
 use super::encode::{Classes, LOG_SCALE_LIMIT};
 use super::geometry::{GRID_BITS, Geometry};
 use super::importance::{Importance, median};
-use cc4dgs_format::storage::PartialLoss;
+use super::restore::Losses;
 use rayon::prelude::*;
 
 /// Largest step of a centre, in middle scales, if no [`Bounds`] are set.
@@ -61,8 +61,8 @@ pub struct Planner<'a> {
     axes: [Vec<f32>; 3],
     /// Of each degree.
     transforms: Vec<Transform>,
-    /// Of the higher degrees, before any is rounded.
-    pub rest: PartialLoss,
+    /// What is known of the losses of the columns before any is rounded.
+    pub losses: Losses,
 }
 
 impl<'a> Planner<'a> {
@@ -72,6 +72,7 @@ impl<'a> Planner<'a> {
         let middle = median(&middles.collect::<Vec<f64>>());
         let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
         let transform = |degree: usize| Transform::of(gaussians.coefficients(degree), &squared, &choices);
+        let (transforms, losses) = rayon::join(|| (0..=gaussians.sh_degree).into_par_iter().map(transform).collect(), || Losses::new(gaussians));
         Self {
             gaussians,
             importance,
@@ -80,8 +81,8 @@ impl<'a> Planner<'a> {
             scale_origin: (finite().sum::<f64>() / finite().count().max(1) as f64) as f32,
             middle,
             axes: sorted_axes(gaussians.means),
-            transforms: (0..=gaussians.sh_degree).map(transform).collect(),
-            rest: PartialLoss::new(gaussians.sh_rest),
+            transforms,
+            losses,
         }
     }
     /// Plans for other Gaussians of the same importance.

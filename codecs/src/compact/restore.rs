@@ -1,107 +1,140 @@
 //! What integers stand for: columns as they will be decoded, and what these lose. Rows that are stored exactly are those given.
 
 use super::blocks::ROWS;
-use super::columns::Columns;
+use super::columns::{Columns, sorted};
 use super::encode::Integers;
-use cc4dgs_format::HostGaussians;
-use cc4dgs_format::storage::{PartialLoss, column_loss, relative_rms};
+use cc4dgs_format::storage::{ColumnLoss, PartialLoss};
+use cc4dgs_format::{ExtraAttribute, HostGaussians};
 use rayon::prelude::*;
 
-/// What the integers of `given` stand for, in the same order.
-pub fn restored(of: &Integers, given: Columns) -> HostGaussians {
+/// The row at each place: those of the columns given, or those that are listed.
+type Order<'a> = Option<&'a [usize]>;
+
+/// What the integers of `given` stand for, with the rows in this `order` `[N]`, or in that of `given`.
+pub fn restored(of: &Integers, given: Columns, order: Option<&[usize]>) -> HostGaussians {
     let mut sh_rest = vec![0.0; given.sh_rest.len()];
-    of.rest(given.sh_rest, 0, &mut sh_rest);
-    let mut extra = given.extra.clone();
-    extra.extend(of.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.restored())));
+    of.rest(given.sh_rest, |place| order.map_or(place, |order| order[place]), &mut sh_rest);
+    let in_order = |attribute: &ExtraAttribute| order.map_or_else(|| attribute.clone(), |order| attribute.select(order));
+    let extra = |(name, attribute): (&String, &ExtraAttribute)| {
+        let coded = of.attributes.iter().find(|coded| coded.coding.name == *name);
+        (name.clone(), coded.map_or_else(|| in_order(attribute), |coded| in_order(&coded.restored())))
+    };
     HostGaussians {
         sh_degree: given.sh_degree,
-        means: of.means(given.means),
-        log_scales: of.log_scales(given.log_scales),
-        quaternions: of.quaternions(given.quaternions),
-        opacity_logits: of.opacity_logits(given.opacity_logits),
-        sh_dc: of.sh_dc(given.sh_dc),
+        means: of.means(given.means, order),
+        log_scales: of.log_scales(given.log_scales, order),
+        quaternions: of.quaternions(given.quaternions, order),
+        opacity_logits: of.opacity_logits(given.opacity_logits, order),
+        sh_dc: of.sh_dc(given.sh_dc, order),
         sh_rest,
-        dynamic_scores: given.dynamic_scores.to_vec(),
-        extra,
+        dynamic_scores: order.map_or_else(|| given.dynamic_scores.to_vec(), |order| sorted(given.dynamic_scores.to_vec(), 1, order)),
+        extra: given.extra.iter().map(extra).collect(),
     }
 }
 
-/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`]). Each thread has one of them in memory, and of the
-/// higher degrees a block of rows; `rest` is the loss of these before any is decoded.
-pub fn losses(of: &Integers, given: Columns, rest: PartialLoss) -> Vec<f64> {
-    let loss = |column: usize| match column {
-        0 => column_loss("means", given.means, &of.means(given.means), 3),
-        1 => relative_rms(given.log_scales, &of.log_scales(given.log_scales)),
-        2 => relative_rms(given.quaternions, &of.quaternions(given.quaternions)),
-        3 => relative_rms(given.opacity_logits, &of.opacity_logits(given.opacity_logits)),
-        4 => relative_rms(given.sh_dc, &of.sh_dc(given.sh_dc)),
-        _ => of.rest_loss(given.sh_rest, rest),
+/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`](cc4dgs_format::storage::column_loss)). Each thread has
+/// one of them in memory, and of the higher degrees a block of rows. Those that are `known` are taken.
+pub fn losses(of: &Integers, given: Columns, before: &Losses, known: [Option<f64>; 6]) -> Vec<f64> {
+    let loss = |column: usize| {
+        if let Some(loss) = known[column] {
+            return loss;
+        }
+        let (values, decoded) = match column {
+            0 => (given.means, of.means(given.means, None)),
+            1 => (given.log_scales, of.log_scales(given.log_scales, None)),
+            2 => (given.quaternions, of.quaternions(given.quaternions, None)),
+            3 => (given.opacity_logits, of.opacity_logits(given.opacity_logits, None)),
+            4 => (given.sh_dc, of.sh_dc(given.sh_dc, None)),
+            _ => return of.rest_loss(given.sh_rest, before.rest),
+        };
+        before.columns[column].of(values, &decoded)
     };
     (0..6).into_par_iter().map(loss).collect()
 }
 
-/// A column `[N,width]` whose rows `restore` fills, except those that are stored `exact`, which are those of `given`.
-fn column(given: &[f32], width: usize, exact: &[usize], restore: impl Fn(usize, &mut [f32]) + Sync) -> Vec<f32> {
-    let mut out = vec![0.0; given.len()];
-    out.par_chunks_exact_mut(width).enumerate().for_each(|(row, values)| restore(row, values));
-    for row in exact {
-        let values = row * width..(row + 1) * width;
-        out[values.clone()].copy_from_slice(&given[values]);
+/// What is known of the [`losses`] of columns before any is decoded.
+pub struct Losses {
+    /// Means, log-scales, quaternions, opacity logits, degree 0.
+    columns: [ColumnLoss; 5],
+    rest: PartialLoss,
+}
+
+impl Losses {
+    /// Of the columns `given`.
+    pub fn new(given: Columns) -> Self {
+        let columns = [
+            ("means", given.means, 3),
+            ("log_scales", given.log_scales, 3),
+            ("quaternions", given.quaternions, 4),
+            ("opacity_logits", given.opacity_logits, 1),
+            ("sh_dc", given.sh_dc, 3),
+        ];
+        // The higher degrees take as long as all others.
+        let (rest, columns) = rayon::join(|| PartialLoss::new(given.sh_rest), || columns.map(|(name, values, width)| ColumnLoss::new(name, values, width)));
+        Self { columns, rest }
     }
+}
+
+/// A column `[N,width]` in this `order`, whose rows `restore` fills, except those that are stored `exact` (ascending), which are those of `given`.
+fn column(given: &[f32], width: usize, exact: &[usize], order: Order, restore: impl Fn(usize, &mut [f32]) + Sync) -> Vec<f32> {
+    let mut out = vec![0.0; given.len()];
+    out.par_chunks_exact_mut(width).enumerate().for_each(|(place, values)| {
+        let row = order.map_or(place, |order| order[place]);
+        if exact.binary_search(&row).is_ok() {
+            values.copy_from_slice(&given[row * width..(row + 1) * width]);
+        } else {
+            restore(row, values);
+        }
+    });
     out
 }
 
 impl Integers<'_> {
-    fn means(&self, given: &[f32]) -> Vec<f32> {
+    fn means(&self, given: &[f32], order: Order) -> Vec<f32> {
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let shift = |i: usize| geometry.position_shift(self.scales[i], shapes[i]);
-        column(given, 3, &self.exact[0], |i, out| out.copy_from_slice(&geometry.centre(self.keys[i], shift(i))))
+        column(given, 3, &self.exact[0], order, |i, out| out.copy_from_slice(&geometry.centre(self.keys[i], shift(i))))
     }
-    fn log_scales(&self, given: &[f32]) -> Vec<f32> {
+    fn log_scales(&self, given: &[f32], order: Order) -> Vec<f32> {
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let restore = |i: usize, out: &mut [f32]| out.iter_mut().zip(self.scales[i]).for_each(|(out, code)| *out = geometry.scale(code, shapes[i]));
-        column(given, 3, &self.exact[1], restore)
+        column(given, 3, &self.exact[1], order, restore)
     }
-    fn quaternions(&self, given: &[f32]) -> Vec<f32> {
+    fn quaternions(&self, given: &[f32], order: Order) -> Vec<f32> {
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let step = |i: usize| geometry.rotation(geometry.rotation_shift(self.scales[i], shapes[i]));
-        column(given, 4, &self.exact[2], |i, out| out.copy_from_slice(&self.rotations[i].quaternion(step(i))))
+        column(given, 4, &self.exact[2], order, |i, out| out.copy_from_slice(&self.rotations[i].quaternion(step(i))))
     }
-    fn opacity_logits(&self, given: &[f32]) -> Vec<f32> {
+    fn opacity_logits(&self, given: &[f32], order: Order) -> Vec<f32> {
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
-        column(given, 1, &self.exact[3], |i, out| out.fill(geometry.opacity(self.opacities[i], shapes[i])))
+        column(given, 1, &self.exact[3], order, |i, out| out.fill(geometry.opacity(self.opacities[i], shapes[i])))
     }
-    fn sh_dc(&self, given: &[f32]) -> Vec<f32> {
+    fn sh_dc(&self, given: &[f32], order: Order) -> Vec<f32> {
         let (plan, codes) = (&self.plan.degrees[0], &self.colors[0]);
         let basis = plan.scaled_basis();
         let codes_of = |i: usize| &codes.values[i * plan.dims..(i + 1) * plan.dims];
-        column(given, plan.dims, &codes.missing, |i, out| plan.restore(&basis, codes_of(i), self.classes.colors[i], out))
+        column(given, plan.dims, &codes.missing, order, |i, out| plan.restore(&basis, codes_of(i), self.classes.colors[i], out))
     }
-    /// Fills `out` `[M,width]` with the higher degrees of the rows from `first` on; `given` are those of all rows.
-    fn rest(&self, given: &[f32], first: usize, out: &mut [f32]) {
+    /// Fills `out` `[M,width]` with the higher degrees of the rows that `row_at` says are at each place; `given` are those of all rows.
+    fn rest(&self, given: &[f32], row_at: impl Fn(usize) -> usize + Sync, out: &mut [f32]) {
         let higher = || self.plan.degrees.iter().zip(&self.colors).skip(1);
         let width = higher().map(|(plan, _)| plan.dims).sum::<usize>();
         if out.is_empty() {
             return;
         }
         let bases: Vec<Vec<f32>> = higher().map(|(plan, _)| plan.scaled_basis()).collect();
-        out.par_chunks_exact_mut(width).enumerate().for_each(|(k, values)| {
-            let (row, mut at) = (first + k, 0);
+        out.par_chunks_exact_mut(width).enumerate().for_each(|(place, values)| {
+            let (row, mut at) = (row_at(place), 0);
             for ((plan, codes), basis) in higher().zip(&bases) {
-                let codes = &codes.values[row * plan.dims..(row + 1) * plan.dims];
-                plan.restore(basis, codes, self.classes.colors[row], &mut values[at..at + plan.dims]);
+                let values = &mut values[at..at + plan.dims];
+                if codes.missing.binary_search(&row).is_ok() {
+                    values.copy_from_slice(&given[row * width + at..row * width + at + plan.dims]);
+                } else {
+                    plan.restore(basis, &codes.values[row * plan.dims..(row + 1) * plan.dims], self.classes.colors[row], values);
+                }
                 at += plan.dims;
             }
         });
-        let (end, mut at) = (first + out.len() / width, 0);
-        for (plan, codes) in higher() {
-            let from = codes.missing.partition_point(|row| *row < first);
-            for row in codes.missing[from..].iter().take_while(|row| **row < end) {
-                let (to, from) = ((row - first) * width + at, row * width + at);
-                out[to..to + plan.dims].copy_from_slice(&given[from..from + plan.dims]);
-            }
-            at += plan.dims;
-        }
     }
     /// The `loss` of the higher degrees, which are restored block by block.
     fn rest_loss(&self, given: &[f32], mut loss: PartialLoss) -> f64 {
@@ -109,7 +142,7 @@ impl Integers<'_> {
         let mut block = vec![0.0; size.min(given.len())];
         for (k, values) in given.chunks(size.max(1)).enumerate() {
             let restored = &mut block[..values.len()];
-            self.rest(given, k * ROWS, restored);
+            self.rest(given, |place| k * ROWS + place, restored);
             loss.add(values, restored);
         }
         loss.loss()
@@ -122,6 +155,7 @@ mod tests {
     use super::super::plan::{Bounds, Planner};
     use super::super::{Choices, importance};
     use super::*;
+    use cc4dgs_format::storage::column_loss;
     use cc4dgs_format::{CodecContext, Limits, Seed, Silent};
 
     #[test]
@@ -139,18 +173,27 @@ mod tests {
         let mut of = plan.quantise(columns, &[false; 300], &classes, plan.color_codes(columns, &classes, None, None));
         // Rows of degree 2 that are stored exactly.
         of.colors[2].missing = vec![3, 200];
-        let whole = restored(&of, columns);
+        let whole = restored(&of, columns, None);
         let of_degree = |g: &HostGaussians, row: usize| g.sh_rest[24 * row + 9..24 * (row + 1)].to_vec();
         assert_eq!([3, 4, 200].map(|row| of_degree(&whole, row) == of_degree(&g, row)), [true, false, true]);
         for (first, rows) in [(0, 300), (0, 4), (3, 1), (4, 196), (199, 2), (201, 99)] {
             let mut part = vec![0.0; 24 * rows];
-            of.rest(&g.sh_rest, first, &mut part);
+            of.rest(&g.sh_rest, |place| first + place, &mut part);
             assert!(part == whole.sh_rest[24 * first..24 * (first + rows)], "{rows} rows from {first} on");
         }
-        let found = losses(&of, columns, planner.rest);
+        let found = losses(&of, columns, &planner.losses, [None; 6]);
         for (((name, width, given), (_, _, decoded)), lost) in g.columns().into_iter().zip(whole.columns()).zip(&found) {
             assert!(*lost > 0.0 && lost.to_bits() == column_loss(name, given, decoded, width).to_bits(), "{name}: {lost}");
         }
-        assert_eq!(found.len(), 6);
+        let known = [None, None, None, None, Some(0.25), Some(0.5)];
+        assert_eq!(losses(&of, columns, &planner.losses, known), [&found[..4], &[0.25, 0.5][..]].concat());
+        // Rows that are stored exactly are exact wherever they are.
+        of.exact = [vec![7], vec![0, 8], vec![150], vec![299]];
+        of.colors[0].missing = vec![11];
+        let extra = [("velocity".to_string(), ExtraAttribute::exact(1, (0..300).map(|row| row as f32).collect()))].into();
+        let columns = Columns { extra: &extra, ..columns };
+        let (own, order) = (restored(&of, columns, None), (0..300).map(|place| place * 7 % 300).collect::<Vec<usize>>());
+        assert!(own.means[21..24] == g.means[21..24] && own.sh_dc[33..36] == g.sh_dc[33..36] && own.means != whole.means);
+        assert!(restored(&of, columns, Some(&order)) == own.select(&order));
     }
 }

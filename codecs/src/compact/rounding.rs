@@ -24,7 +24,7 @@ pub struct Rounder<'a> {
 
 impl Rounding for Rounder<'_> {
     fn round(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        Ok(restored(&self.codes(gaussians), gaussians.into()))
+        Ok(restored(&self.codes(gaussians), gaussians.into(), None))
     }
     fn steps(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
         let codes = self.codes(gaussians);

@@ -1,9 +1,9 @@
 //! The search for the quality that uses up an allowed size, loss or difference of images, with its corrections and fine-tuning.
 
-use super::images::Images;
+use super::images::{Images, Recorded};
 use super::importance::{Importance, budget};
 use super::job::{Attempt, Job};
-use super::seek::{ATTEMPTS, Allowance, GOOD, PARAMETERS, ROUGH, Tried, seek};
+use super::seek::{Allowance, GOOD, PARAMETERS, ROUGH, Tried, seek};
 use super::settings::Settings;
 use super::tune::{self, Goal, Tuned, Untuned};
 use super::{allocate, bytes_of};
@@ -48,8 +48,8 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             let of = if by_drop { judges } else { views };
             let chosen = of.len().min(budget(WORK, gaussians.len(), VIEWS));
             if by_drop {
-                let before = psnr_on_views(whole, judges, renderer, chosen)?;
-                Allowance::Drop { before, limit: settings.max_drop_db, judges, renderer, chosen }
+                let recorded = Recorded::of(judges, renderer, chosen)?;
+                Allowance::Drop { before: recorded.psnr(whole)?, limit: settings.max_drop_db, recorded }
             } else {
                 let images = Images::of(whole, views, renderer, chosen)?;
                 if images.show_nothing(renderer.background()) {
@@ -182,9 +182,9 @@ fn bytes_of_file(settings: &Settings, context: &CodecContext) -> Result<f64> {
 fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settings: &Settings, context: &CodecContext) -> Result<()> {
     let object = "codec compact";
     let (megabytes, steps) = (bytes as f64 / 1e6, found.attempt.quality / start);
-    let ended = if found.last { format!("; the search ended after {ATTEMPTS} attempts") } else { String::new() };
-    if found.last && found.allowed() && found.share < ROUGH {
-        let used = format!("the search ended after {ATTEMPTS} attempts and uses {:.0} % of what is allowed", 100.0 * found.share.max(0.0));
+    let ended = found.ended.map(|attempts| format!("; the search ended after {attempts} attempts")).unwrap_or_default();
+    if let Some(attempts) = found.ended.filter(|_| found.allowed() && found.share < ROUGH) {
+        let used = format!("the search ended after {attempts} attempts and uses {:.0} % of what is allowed", 100.0 * found.share.max(0.0));
         let message = format!("{used}: there may be a better file, which a bound that is a little different may find");
         context.events.emit(&Event::Warning { object: object.into(), message });
     }
@@ -201,8 +201,8 @@ fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settin
                 format!("{megabytes:.4} MB of Gaussians, {file:.4} MB in all ({allowed} MB allowed), steps {steps:.3} times the estimated ones{ended}"),
             );
         }
-        Allowance::Drop { limit, judges, chosen, .. } => {
-            let (drop, kind) = (found.share * limit, judges.kind());
+        Allowance::Drop { limit, recorded, .. } => {
+            let (drop, kind, chosen) = (found.share * limit, recorded.kind, recorded.len());
             if !found.allowed() {
                 let problem = format!("the best of all attempts loses {drop:.3} dB on {kind} views, {limit} dB are allowed");
                 if settings.drop_wanted {

@@ -1,12 +1,13 @@
 //! The step factor that uses up an allowed size, loss or difference of images, found by attempts.
 
-use super::images::Images;
+use super::images::{Images, Recorded};
 use super::job::{Attempt, Job};
 use super::search::file_bytes;
-use cc4dgs_format::{CodecContext, Error, RenderModel, Result, Stream, TrainingViews, psnr_on_views};
+use cc4dgs_format::{CodecContext, Error, Result, Stream};
 
-/// Attempts of a search, at most.
-pub const ATTEMPTS: usize = 8;
+/// Attempts of a search, at most; and as many more where it has found no file that is small enough, which is where an octave of the steps saves fewer bytes than
+/// expected.
+const ATTEMPTS: usize = 8;
 /// Parameters of a Gaussian that are not rounded to zero, for the estimate of the error.
 pub const PARAMETERS: f64 = 20.0;
 /// Shares of an allowance that are good enough: before the steps of the columns are corrected, and at the end. A search that ends with less than the first is
@@ -18,6 +19,8 @@ const AIM: f64 = 0.985;
 /// Octaves of the step factor by which attempts differ, at most, and the share of a known interval that they stay away from its ends.
 const FARTHEST: f64 = 2.0;
 const MARGIN: f64 = 0.08;
+/// Octaves of the largest leap to coarser steps. With those before, most values of any model become zero.
+const LARGEST_LEAP: f64 = 8.0;
 /// Least share from which a loss is extrapolated: smaller ones are noise.
 const LEAST: f64 = 0.05;
 
@@ -26,7 +29,7 @@ pub enum Allowance<'a> {
     /// Bytes of the file ([`file_bytes`]). Larger steps use fewer.
     Bytes { limit: f64, context: &'a CodecContext<'a> },
     /// PSNR on the views that judge, in dB below `before`. Larger steps lose more.
-    Drop { before: f64, limit: f64, judges: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize },
+    Drop { before: f64, limit: f64, recorded: Recorded<'a> },
     /// The mean squared difference between images before and after, of views of this kind. Larger steps differ more.
     Difference { limit: f64, images: Images<'a>, kind: &'static str },
 }
@@ -37,16 +40,16 @@ impl Allowance<'_> {
         match self {
             Self::Bytes { limit, context } => {
                 let (attempt, streams) = job.coded(&job.planner, quality, &job.factors)?;
-                Ok(Tried { attempt, share: file_bytes(context, &streams, None)? / limit, streams: Some(streams), last: false })
+                Ok(Tried { attempt, share: file_bytes(context, &streams, None)? / limit, streams: Some(streams), ended: None })
             }
-            Self::Drop { before, limit, judges, renderer, chosen } => {
+            Self::Drop { before, limit, recorded } => {
                 let (attempt, rounded) = job.attempt(quality)?;
-                let share = (before - psnr_on_views(&rounded, *judges, *renderer, *chosen)?) / limit;
-                Ok(Tried { attempt, share, streams: None, last: false })
+                let share = (before - recorded.psnr(&rounded)?) / limit;
+                Ok(Tried { attempt, share, streams: None, ended: None })
             }
             Self::Difference { limit, images, .. } => {
                 let (attempt, rounded) = job.attempt(quality)?;
-                Ok(Tried { attempt, share: images.mean_squared_error(&rounded)? / limit, streams: None, last: false })
+                Ok(Tried { attempt, share: images.mean_squared_error(&rounded)? / limit, streams: None, ended: None })
             }
         }
     }
@@ -74,8 +77,9 @@ pub struct Tried {
     pub share: f64,
     /// Where it was coded.
     pub streams: Option<Vec<Stream>>,
-    /// Whether no attempt was left when it was chosen, none was good enough, and another might be better: a size may be more than the finest steps fill.
-    pub last: bool,
+    /// After how many attempts it was chosen where none was left, none was good enough, and another might be better: a size may be more than the finest steps
+    /// fill.
+    pub ended: Option<usize>,
 }
 
 impl Tried {
@@ -87,40 +91,70 @@ impl Tried {
     }
 }
 
+/// What attempts have found. Places are octaves over the step factor at the start, in the direction in which more is used.
+struct Found {
+    /// The attempt that uses most of what is allowed, and its place.
+    best: Option<(f64, Tried)>,
+    /// Of those that use too much, the one that uses least, and the first place of any.
+    least: Option<Tried>,
+    refused: f64,
+}
+
+impl Found {
+    fn add(&mut self, at: f64, tried: Tried) {
+        if !tried.allowed() {
+            self.refused = self.refused.min(at);
+            self.least = self.least.take().filter(|known| known.share <= tried.share).or(Some(tried));
+        } else if self.best.as_ref().is_none_or(|(known, _)| at > *known) {
+            self.best = Some((at, tried));
+        }
+    }
+}
+
 /// The attempt that uses most of what is allowed, from the step factor `start`; the one that uses least if none is allowed. A share of `good` ends the search.
 /// `first` is the attempt at `start`, where it has been made before.
 pub fn seek(job: &Job, start: f64, mut first: Option<Tried>, allowance: &Allowance, good: f64) -> Result<Tried> {
     let direction = allowance.direction();
-    // Octaves over `start` in the direction in which more is used.
-    let (mut at, mut refused) = (0.0, f64::INFINITY);
-    let mut best: Option<(f64, Tried)> = None;
-    let mut least = None;
+    let tried_at = |at: f64| allowance.tried(job, start * libm::exp2(direction * at));
+    let (mut at, mut attempts) = (0.0, ATTEMPTS);
+    let mut found = Found { best: None, least: None, refused: f64::INFINITY };
     for _ in 0..ATTEMPTS {
-        let tried = first.take().map_or_else(|| allowance.tried(job, start * libm::exp2(direction * at)), Ok)?;
-        let step = direction * allowance.octaves(job.planner.gaussians.len(), tried.share);
-        if tried.allowed() {
-            if tried.share >= good {
-                return Ok(tried);
-            }
-            if best.as_ref().is_none_or(|(known, _)| at > *known) {
-                best = Some((at, tried));
-            }
-        } else {
-            refused = refused.min(at);
-            least = least.filter(|known: &Tried| known.share <= tried.share).or(Some(tried));
+        let tried = first.take().map_or_else(|| tried_at(at), Ok)?;
+        if tried.allowed() && tried.share >= good {
+            return Ok(tried);
         }
+        let step = direction * allowance.octaves(job.planner.gaussians.len(), tried.share);
+        found.add(at, tried);
         let next = at + step.clamp(-FARTHEST, FARTHEST);
-        at = match &best {
-            Some((known, _)) if refused > *known && refused.is_finite() => {
-                let margin = MARGIN * (refused - known);
-                next.clamp(known + margin, refused - margin)
+        at = match &found.best {
+            Some((known, _)) if found.refused > *known && found.refused.is_finite() => {
+                let margin = MARGIN * (found.refused - known);
+                next.clamp(known + margin, found.refused - margin)
             }
             Some((known, _)) => next.max(known + MARGIN),
-            None => next.min(refused - MARGIN),
+            None => next.min(found.refused - MARGIN),
         };
     }
-    match best.map(|(_, tried)| tried).or(least) {
-        Some(tried) => Ok(Tried { last: refused.is_finite() || !allowance.is_of_bytes(), ..tried }),
+    if found.best.is_none() && allowance.is_of_bytes() {
+        let mut leap = FARTHEST;
+        for _ in 0..ATTEMPTS {
+            let at = match &found.best {
+                Some((known, _)) => 0.5 * (known + found.refused),
+                None if leap > LARGEST_LEAP => break,
+                None => found.refused - leap,
+            };
+            leap *= 2.0;
+            attempts += 1;
+            let tried = tried_at(at)?;
+            if tried.allowed() && tried.share >= good {
+                return Ok(tried);
+            }
+            found.add(at, tried);
+        }
+    }
+    let ended = Some(attempts).filter(|_| found.refused.is_finite() || !allowance.is_of_bytes());
+    match found.best.map(|(_, tried)| tried).or(found.least) {
+        Some(tried) => Ok(Tried { ended, ..tried }),
         None => Err(Error::backend("codec compact", "no step factor was tried", "Report this")),
     }
 }

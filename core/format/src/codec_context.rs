@@ -101,6 +101,25 @@ pub trait RenderModel {
         let _ = (gaussians, camera, time_norm, seed);
         Ok(None)
     }
+    /// [`RenderModel::squared_derivatives`] of `gaussians` in each of `views`, which are cameras and times (0..1), with the seeds `seed.index(0)`,
+    /// `seed.index(1)` and so on; what views share need not be computed for each. `take` is called with the index of each view in turn, the estimate, and the
+    /// centres `[N,3]` as they are drawn, where the renderer tells them. Whether it has derivatives.
+    ///
+    /// # Errors
+    /// What the renderer reports, and the first error of `take`.
+    fn squared_derivatives_in_views(
+        &self,
+        gaussians: &HostGaussians,
+        views: &[(&Camera, f32)],
+        seed: Seed,
+        take: &mut dyn FnMut(usize, HostGaussians, Option<Vec<f32>>) -> Result<()>,
+    ) -> Result<bool> {
+        for (index, &(camera, time_norm)) in views.iter().enumerate() {
+            let Some(found) = self.squared_derivatives(gaussians, camera, time_norm, seed.index(index as u64))? else { return Ok(false) };
+            take(index, found, None)?;
+        }
+        Ok(true)
+    }
 }
 
 /// Mean PSNR in dB of `gaussians`, rendered, against the recorded images of at most `most` views, which are evenly spaced. Rendered values are clamped to 0..1
@@ -115,8 +134,7 @@ pub fn psnr_on_views(gaussians: &HostGaussians, views: &dyn TrainingViews, rende
     let mut sum = 0.0;
     renderer.render_views(gaussians, &cameras, &mut |k, drawn| {
         let truth = views.image(index(k))?.to_planes(renderer.background());
-        let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
-        sum += psnr_of(error / truth.len().max(1) as f64);
+        sum += drawn.psnr(&truth);
         Ok(())
     })?;
     Ok(sum / chosen.max(1) as f64)
@@ -145,6 +163,11 @@ pub struct RenderedPlanes {
 }
 
 impl RenderedPlanes {
+    /// PSNR in dB of the colours, clamped to 0..1, against the planes `truth` `[3,H,W]`.
+    pub fn psnr(&self, truth: &[f32]) -> f64 {
+        let error: f64 = truth.iter().zip(&self.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
+        psnr_of(error / truth.len().max(1) as f64)
+    }
     /// The RGB planes as an 8-bit image; values are clamped to 0..1.
     pub fn to_image(&self) -> Image8 {
         Image8::from_planes(&self.planes, self.width, self.height)

@@ -216,15 +216,6 @@ impl HostGaussians {
         out.extra = self.extra.iter().map(|(name, a)| (name.clone(), a.select(keep))).collect();
         out
     }
-    /// [`HostGaussians::select`] of Gaussians that are not needed afterwards. One column at a time is in memory twice.
-    #[must_use]
-    pub fn into_selected(mut self, keep: &[usize]) -> Self {
-        for (_, width, values) in self.columns_mut() {
-            *values = pick(values, width, keep);
-        }
-        self.extra.values_mut().for_each(|a| *a = a.select(keep));
-        self
-    }
 }
 
 #[cfg(test)]
@@ -242,7 +233,6 @@ mod tests {
             assert_eq!(*values, [3.0f32, 0.0, 3.0].map(|v| vec![v; width]).concat(), "{name}");
         }
         assert_eq!(found.extra["a"], ExtraAttribute::exact(2, vec![3.0, 3.0, 0.0, 0.0, 3.0, 3.0]).needed_in(vec![true, false, true], 0.5));
-        assert_eq!(host.into_selected(&[3, 0, 3]), found);
     }
 
     #[test]

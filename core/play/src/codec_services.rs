@@ -8,6 +8,7 @@ use cc4dgs_core::{
     Camera, Deformer, EvaluateDeformer, Gaussians, HostGaussians, Image8, ParameterSpace, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes,
     Result, Scene, Seed, SpatialInput, SplatColors, Splats, Split, TrainingViews,
 };
+use rayon::prelude::*;
 
 /// The views of one split of a scene, camera after camera ([`by_camera`]): every so many are of all cameras.
 pub struct SceneViews<'a> {
@@ -102,6 +103,52 @@ impl<'a> ModelServices<'a> {
         let output = self.rasterizer.render(&Splats::from_gaussians(moved, moved.sh_degree), camera, &self.settings)?;
         Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
     }
+    /// The estimate of [`RenderModel::squared_derivatives`] for Gaussians as they are drawn.
+    fn squares(&self, mut moved: Gaussians, camera: &Camera, seed: Seed) -> Result<HostGaussians> {
+        let tracked = self.device.clone().autodiff();
+        let leaf = |t: Tensor<2>| Tensor::<2>::from_inner(t).require_grad();
+        let [n, coefficients, _] = moved.sh_rest.dims();
+        // A colour below 0 is drawn as 0 and has no derivative, but a rounded one may be above. All colours and the background are made brighter alike, which
+        // changes no other derivative.
+        moved.sh_dc = moved.sh_dc + BRIGHTER / SH0;
+        let (means, log_scales, quaternions, sh_dc) = (leaf(moved.means), leaf(moved.log_scales), leaf(moved.quaternions), leaf(moved.sh_dc));
+        let opacity_logits = Tensor::<1>::from_inner(moved.opacity_logits).require_grad();
+        let sh_rest = Tensor::<3>::from_inner(moved.sh_rest).require_grad();
+        let splats = Splats {
+            means: means.clone(),
+            scales: log_scales.clone(),
+            quaternions: quaternions.clone(),
+            opacities: opacity_logits.clone(),
+            colors: SplatColors::Sh { dc: sh_dc.clone(), rest: sh_rest.clone(), degree: moved.sh_degree },
+            space: ParameterSpace::Raw,
+            screen_probe: None,
+            absolute_screen_probe: None,
+            camera_probe: None,
+        };
+        let background = self.settings.background.clone().map(|b| Tensor::<1>::from_inner(b + BRIGHTER));
+        let planes = self.rasterizer.render(&splats, camera, &RenderSettings { background, ..self.settings.clone() })?.image();
+        let shape = planes.dims();
+        let signs = rand_signs(seed, shape.iter().product());
+        let gradients = (planes * Tensor::<3>::from_data(TensorData::new(signs, shape), &tracked)).sum().backward();
+        fn squared<const D: usize>(gradient: Option<Tensor<D>>, count: usize, name: &str) -> Result<Vec<f32>> {
+            // A tensor that no pixel depends on has no gradient.
+            let Some(gradient) = gradient else { return Ok(vec![0.0; count]) };
+            let mut values = to_vec(gradient, name)?;
+            values.par_iter_mut().for_each(|v| *v = if v.is_finite() { *v * *v } else { 0.0 });
+            Ok(values)
+        }
+        Ok(HostGaussians {
+            sh_degree: moved.sh_degree,
+            means: squared(means.grad(&gradients), 3 * n, "derivatives by centres")?,
+            log_scales: squared(log_scales.grad(&gradients), 3 * n, "derivatives by scales")?,
+            quaternions: squared(quaternions.grad(&gradients), 4 * n, "derivatives by rotations")?,
+            opacity_logits: squared(opacity_logits.grad(&gradients), n, "derivatives by opacities")?,
+            sh_dc: squared(sh_dc.grad(&gradients), 3 * n, "derivatives by colours")?,
+            sh_rest: squared(sh_rest.grad(&gradients), 3 * n * coefficients, "derivatives by colours")?,
+            dynamic_scores: vec![0.0; n],
+            extra: Default::default(),
+        })
+    }
 }
 
 /// Canonical Gaussians on the device, and how they move, if they do.
@@ -143,55 +190,33 @@ impl RenderModel for ModelServices<'_> {
         self.model.background_on(None)
     }
     fn squared_derivatives(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32, seed: Seed) -> Result<Option<HostGaussians>> {
-        let tracked = self.device.clone().autodiff();
-        let leaf = |t: Tensor<2>| Tensor::<2>::from_inner(t).require_grad();
-        let mut moved = self.moved(gaussians, time_norm)?;
-        let [n, coefficients, _] = moved.sh_rest.dims();
-        // A colour below 0 is drawn as 0 and has no derivative, but a rounded one may be above. All colours and the background are made brighter alike, which
-        // changes no other derivative.
-        moved.sh_dc = moved.sh_dc + BRIGHTER / SH0;
-        let (means, log_scales, quaternions, sh_dc) = (leaf(moved.means), leaf(moved.log_scales), leaf(moved.quaternions), leaf(moved.sh_dc));
-        let opacity_logits = Tensor::<1>::from_inner(moved.opacity_logits).require_grad();
-        let sh_rest = Tensor::<3>::from_inner(moved.sh_rest).require_grad();
-        let splats = Splats {
-            means: means.clone(),
-            scales: log_scales.clone(),
-            quaternions: quaternions.clone(),
-            opacities: opacity_logits.clone(),
-            colors: SplatColors::Sh { dc: sh_dc.clone(), rest: sh_rest.clone(), degree: moved.sh_degree },
-            space: ParameterSpace::Raw,
-            screen_probe: None,
-            absolute_screen_probe: None,
-            camera_probe: None,
-        };
-        let background = self.settings.background.clone().map(|b| Tensor::<1>::from_inner(b + BRIGHTER));
-        let planes = self.rasterizer.render(&splats, camera, &RenderSettings { background, ..self.settings.clone() })?.image();
-        let shape = planes.dims();
-        let signs = rand_signs(seed, shape.iter().product());
-        let gradients = (planes * Tensor::<3>::from_data(TensorData::new(signs, shape), &tracked)).sum().backward();
-        fn squared<const D: usize>(gradient: Option<Tensor<D>>, count: usize, name: &str) -> Result<Vec<f32>> {
-            // A tensor that no pixel depends on has no gradient.
-            let Some(gradient) = gradient else { return Ok(vec![0.0; count]) };
-            Ok(to_vec(gradient, name)?.into_iter().map(|v| if v.is_finite() { v * v } else { 0.0 }).collect())
+        self.squares(self.moved(gaussians, time_norm)?, camera, seed).map(Some)
+    }
+    fn squared_derivatives_in_views(
+        &self,
+        gaussians: &HostGaussians,
+        views: &[(&Camera, f32)],
+        seed: Seed,
+        take: &mut dyn FnMut(usize, HostGaussians, Option<Vec<f32>>) -> Result<()>,
+    ) -> Result<bool> {
+        let unmoved = self.unmoved(gaussians)?;
+        for (index, &(camera, time_norm)) in views.iter().enumerate() {
+            let moved = unmoved.at(time_norm)?;
+            let means = to_vec(moved.means.clone(), "centres")?;
+            take(index, self.squares(moved, camera, seed.index(index as u64))?, Some(means))?;
         }
-        Ok(Some(HostGaussians {
-            sh_degree: moved.sh_degree,
-            means: squared(means.grad(&gradients), 3 * n, "derivatives by centres")?,
-            log_scales: squared(log_scales.grad(&gradients), 3 * n, "derivatives by scales")?,
-            quaternions: squared(quaternions.grad(&gradients), 4 * n, "derivatives by rotations")?,
-            opacity_logits: squared(opacity_logits.grad(&gradients), n, "derivatives by opacities")?,
-            sh_dc: squared(sh_dc.grad(&gradients), 3 * n, "derivatives by colours")?,
-            sh_rest: squared(sh_rest.grad(&gradients), 3 * n * coefficients, "derivatives by colours")?,
-            dynamic_scores: vec![0.0; n],
-            extra: Default::default(),
-        }))
+        Ok(true)
     }
 }
 
 /// `count` numbers of 1 and -1.
 pub(crate) fn rand_signs(seed: Seed, count: usize) -> Vec<f32> {
-    let word = |k: usize| seed.index(k as u64).value();
-    (0..count.div_ceil(64)).flat_map(|k| (0..64).map(move |bit| if word(k) >> bit & 1 == 1 { 1.0 } else { -1.0 })).take(count).collect()
+    let mut signs = vec![0.0; count];
+    signs.par_chunks_mut(64).enumerate().for_each(|(k, signs)| {
+        let word = seed.index(k as u64).value();
+        signs.iter_mut().enumerate().for_each(|(bit, sign)| *sign = if word >> bit & 1 == 1 { 1.0 } else { -1.0 });
+    });
+    signs
 }
 
 #[cfg(test)]

@@ -136,8 +136,22 @@ fn views_share_what_does_not_depend_on_time() {
     for (k, drawn) in &images {
         assert!(*drawn == services.render(&model.gaussians, shown[*k].0, shown[*k].1).unwrap(), "view {k}");
     }
-    assert_eq!(deformer.spatial.load(Ordering::Relaxed), 3);
+    assert_eq!(deformer.spatial.swap(0, Ordering::Relaxed), 3);
     assert!(images[0].1 != images[2].1);
+    // Derivatives do, too.
+    let mut found = Vec::new();
+    let measured = services.squared_derivatives_in_views(&model.gaussians, &shown, Seed::root(1), &mut |k, squares, means| {
+        found.push((k, squares, means));
+        Ok(())
+    });
+    assert!(measured.unwrap() && deformer.spatial.load(Ordering::Relaxed) == 1);
+    for (k, (index, squares, means)) in found.iter().enumerate() {
+        let (camera, time_norm) = shown[k];
+        let alone = services.squared_derivatives(&model.gaussians, camera, time_norm, Seed::root(1).index(k as u64)).unwrap().unwrap();
+        assert!(*index == k && *squares == alone, "view {k}");
+        assert!(*means == Some(services.deform(&model.gaussians, time_norm).unwrap().means), "view {k}");
+    }
+    assert_eq!(found.len(), 3);
 }
 
 #[test]

@@ -306,6 +306,24 @@ fn a_search_that_runs_out_of_attempts_says_so() {
 }
 
 #[test]
+fn a_size_that_only_the_coarsest_steps_have_is_reached() {
+    with_job(0, |job, _, context, _| {
+        // Of this start, all colours are zero after some 16 octaves; attempts are two octaves apart at most.
+        let fine = Settings { psnr_db: 90.0, finetune: 0, allocate: false, ..Default::default() };
+        let start = estimate(fine.psnr_db, job.planner.importance);
+        let coarsest = bytes_of(&job.coded(&job.planner, start * libm::exp2(24.0), &job.factors).unwrap().1);
+        let mut bounded = |limit: usize| search(job, &Settings { max_size_mb: limit as f64 / 1e6, ..fine.clone() }, context);
+        for percent in [102, 110] {
+            let limit = coarsest * percent / 100;
+            let found = bytes_of(&bounded(limit).unwrap());
+            assert!(found <= limit && 100 * found > 93 * limit, "{found} of {limit} bytes, the coarsest has {coarsest}");
+        }
+        let refused = bounded(coarsest * 9 / 10).unwrap_err().to_string();
+        assert!(refused.contains("the smallest file it reached has"), "{refused}");
+    });
+}
+
+#[test]
 fn a_round_follows_where_the_last_one_missed() {
     with_job(0, |job, _, context, _| {
         let attempt = job.attempt(0.01).unwrap().0;

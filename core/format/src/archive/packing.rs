@@ -2,6 +2,7 @@
 
 use super::zstandard::{compress, decompress};
 use crate::{Error, Limits, Result};
+use rayon::prelude::*;
 
 /// The shuffle width is chosen on this many leading bytes of a stream, which bounds the time for long streams.
 const TRIAL_BYTES: usize = 1 << 20;
@@ -59,9 +60,12 @@ pub fn estimate_stored_len(bytes: &[u8]) -> Result<u64> {
 /// The shuffle width that compresses the leading bytes best (no shuffle on a tie), and those bytes compressed.
 fn best_shuffle(bytes: &[u8]) -> Result<(u8, Vec<u8>)> {
     let sample = &bytes[..bytes.len().min(TRIAL_BYTES)];
-    let mut best = (0, compress(sample)?);
-    for shuffle in SHUFFLES.into_iter().filter(|&s| s > 0 && sample.len() >= 2 * usize::from(s)) {
-        let trial = compress(&shuffled(sample, shuffle))?;
+    let fits = |shuffle: &u8| *shuffle > 0 && sample.len() >= 2 * usize::from(*shuffle);
+    let trial = |shuffle: u8| Ok((shuffle, compress(&shuffled(sample, shuffle))?));
+    let trials = || SHUFFLES.into_par_iter().filter(fits).map(trial).collect::<Result<Vec<(u8, Vec<u8>)>>>();
+    let (plain, trials) = rayon::join(|| compress(sample), trials);
+    let mut best = (0, plain?);
+    for (shuffle, trial) in trials? {
         if trial.len() < best.1.len() {
             best = (shuffle, trial);
         }

@@ -88,7 +88,8 @@ impl ArchiveWriter {
     }
 }
 
-/// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On failure `path` is unchanged.
+/// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On failure `path` is unchanged. Where `path` is a symbolic
+/// link, it stays one: the file that it leads to, which need not exist yet, is written in this way.
 ///
 /// On `wasm32` there is no file system and the call is an error; use [`ArchiveWriter::to_bytes`] and similar functions.
 pub fn write_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
@@ -103,6 +104,7 @@ fn write_file(path: &Path, _bytes: &[u8]) -> Result<()> {
 #[cfg(not(target_arch = "wasm32"))]
 fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
     use std::io::Write;
+    let path = &behind_links(path)?;
     let folder = match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
@@ -123,10 +125,53 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
     Ok(())
 }
 
+/// Where `path` leads: itself, or what is behind symbolic links, whether it exists or not. A rename would put the file in the place of the link.
+#[cfg(not(target_arch = "wasm32"))]
+fn behind_links(path: &Path) -> Result<std::path::PathBuf> {
+    /// As many as Linux follows.
+    const MOST_LINKS: usize = 40;
+    let mut at = path.to_path_buf();
+    for _ in 0..MOST_LINKS {
+        match std::fs::read_link(&at) {
+            // What is relative counts from the folder of the link.
+            Ok(to) => at = at.parent().unwrap_or(Path::new("")).join(to),
+            // A file, or nothing yet.
+            Err(_) => return Ok(at),
+        }
+    }
+    Err(Error::io(path, std::io::Error::other(format!("it leads through more than {MOST_LINKS} symbolic links"))))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::archive::Archive;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_symbolic_link_stays_and_its_file_is_replaced() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let is_link = |name: &str| at(name).symlink_metadata().unwrap().is_symlink();
+        std::fs::create_dir(at("real")).unwrap();
+        std::fs::write(at("real/old"), "before").unwrap();
+        // To a file in another folder, to a link, and to nothing yet.
+        symlink("real/old", at("one")).unwrap();
+        symlink(at("one"), at("two")).unwrap();
+        symlink("real/new", at("dangling")).unwrap();
+        for (link, file) in [("one", "real/old"), ("two", "real/old"), ("dangling", "real/new")] {
+            write_atomically(at(link), link.as_bytes()).unwrap();
+            assert!(is_link(link) && !is_link(file), "{link}");
+            assert_eq!(std::fs::read_to_string(at(file)).unwrap(), link);
+        }
+        assert!(is_link("one"));
+        assert_eq!(std::fs::read_dir(at("real")).unwrap().count(), 2, "nothing else is left there");
+        // Links that lead nowhere stay as they are.
+        symlink("round", at("round")).unwrap();
+        let error = write_atomically(at("round"), b"lost").unwrap_err().to_string();
+        assert!(error.contains("symbolic links") && is_link("round"), "{error}");
+    }
 
     #[test]
     fn what_cannot_be_read_again_is_not_written() {

@@ -10,6 +10,7 @@
 //!
 //! `cc4dgs bake` writes the layer into an archive, beside the Gaussians that it moves. [`PlaybackLayer::apply`] is the reference for players.
 
+mod checks;
 mod computed;
 mod layer;
 mod max_error;

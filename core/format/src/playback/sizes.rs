@@ -68,16 +68,16 @@ mod tests {
     use super::super::PlaybackLayer;
     use super::*;
 
-    /// A track that changes nothing, of so many functions.
-    fn track(functions: usize) -> CodedTrack {
+    /// A track of so many functions, which one Gaussian uses at one time.
+    fn track(head: Head, functions: usize) -> CodedTrack {
         CodedTrack {
-            head: Head::Means,
+            head,
             peaks: vec![1.0; functions],
             functions: vec![0; functions],
-            ranks: Vec::new(),
+            ranks: vec![functions as u8],
             step: 1.0,
-            exponents: Vec::new(),
-            coefficients: Vec::new(),
+            exponents: vec![0],
+            coefficients: vec![0; functions * head.width(0)],
         }
     }
 
@@ -85,20 +85,21 @@ mod tests {
     fn counts_over_their_fields_are_refused() {
         let empty = |segments: usize| (1..=segments).map(|last| (last, Vec::new())).collect::<Vec<(usize, Vec<CodedTrack>)>>();
         let one = |tracks: Vec<CodedTrack>| vec![(0, tracks)];
-        let most = [(4, 4096, empty(64)), (0, 1, one(vec![track(255); 5]))];
-        for (degree, samples, segments) in most {
-            assert!(PlaybackLayer::encode(&[], degree, samples, &segments).is_ok());
+        let many = |functions: usize, tracks: usize| one(vec![track(Head::Means, functions); tracks]);
+        let whole = empty(63).into_iter().chain([(4095, Vec::new())]).collect();
+        for (degree, samples, segments) in [(4, 4096, whole), (0, 1, one(Head::ALL.map(|head| track(head, 255)).into()))] {
+            assert!(PlaybackLayer::encode(&[0], degree, samples, &segments).is_ok());
         }
         let over = [
             (5, 1, one(Vec::new()), "spherical-harmonics degree of the playback layer: 5 is over the limit of 4"),
             (0, 4097, one(Vec::new()), "samples of the playback layer: 4097 is over the limit of 4096"),
             (0, 4096, empty(65), "segments of the playback layer: 65 is over the limit of 64"),
             (0, 64, empty(64), "last sample of a segment of the playback layer: 64 is over the limit of 63"),
-            (0, 1, one(vec![track(0); 6]), "tracks of a segment of the playback layer: 6 is over the limit of 5"),
-            (0, 1, one(vec![track(256)]), "functions of a track of the playback layer: 256 is over the limit of 255"),
+            (0, 1, many(0, 6), "tracks of a segment of the playback layer: 6 is over the limit of 5"),
+            (0, 1, many(256, 1), "functions of a track of the playback layer: 256 is over the limit of 255"),
         ];
         for (degree, samples, segments, said) in over {
-            let error = PlaybackLayer::encode(&[], degree, samples, &segments).unwrap_err();
+            let error = PlaybackLayer::encode(&[0], degree, samples, &segments).unwrap_err();
             assert!(matches!(error, Error::Limit { .. }) && error.to_string().starts_with(said), "{error}");
         }
     }
@@ -124,7 +125,7 @@ mod tests {
         // 48 numbers times 255 functions of each Gaussian.
         let ranks = vec![u8::MAX; 350_897];
         assert_eq!(coefficient_count(&ranks[1..], 48).unwrap(), 4_294_967_040);
-        let segment = CodedTrack { head: Head::Colors, ranks, ..track(255) };
+        let segment = CodedTrack { ranks, ..track(Head::Colors, 255) };
         let rows: Vec<usize> = (0..350_897).collect();
         let error = PlaybackLayer::encode(&rows, 3, 1, &[(0, vec![segment])]).unwrap_err();
         assert!(matches!(error, Error::Limit { value: 4_294_979_280, limit: 4_294_967_295, .. }), "{error}");

@@ -6,7 +6,8 @@
 //! 0; `.coefficients`: zigzag u32, function by function, then number by number, then Gaussian by Gaussian of a sufficient rank. A coefficient is its integer
 //! times step times 2^-exponent. All little-endian.
 
-use super::layer::{Head, MAX_SAMPLES, MAX_SEGMENTS, PlaybackLayer, Segment, Track};
+use super::checks::Checks;
+use super::layer::{Head, PlaybackLayer, Segment, Track};
 use super::sizes::{check_counts, coefficient_count, gaps};
 use crate::archive::ByteReader;
 use crate::{Error, Limits, Result, Stream};
@@ -19,7 +20,7 @@ const ROWS: &str = "playback.rows";
 /// Integer that stands for the largest value of a function.
 const FULL: f32 = 32767.0;
 /// Largest exponent: steps of 2^-62 of the coarsest.
-const MAX_EXPONENT: u8 = 62;
+pub(super) const MAX_EXPONENT: u8 = 62;
 
 /// A track as it is stored: integers.
 #[derive(Clone, Debug, PartialEq)]
@@ -76,10 +77,13 @@ impl PlaybackLayer {
     /// The streams of a layer: `rows` (ascending) of Gaussians of degree `sh_degree`, `samples` times, and per segment its last sample and tracks.
     ///
     /// # Errors
-    /// [`Error::Limit`] for counts over what the format holds, [`Error::Parameter`] for rows that do not ascend.
+    /// [`Error::Limit`] for counts over what the format holds, [`Error::Parameter`] for rows that do not ascend and for all that [`PlaybackLayer::decode`]
+    /// refuses, whatever its limits.
     pub fn encode(rows: &[usize], sh_degree: usize, samples: usize, segments: &[(usize, Vec<CodedTrack>)]) -> Result<Vec<Stream>> {
         check_counts(sh_degree, samples, segments)?;
         let gaps = gaps(rows)?;
+        let refuse = |problem: String| Error::parameter("playback layer", problem, "Correct the program that made the layer");
+        let mut checks = Checks::new(samples, segments.len(), rows.len(), sh_degree, refuse)?;
         let mut meta = vec![VERSION, sh_degree as u8];
         meta.extend((samples as u16).to_le_bytes());
         meta.extend((segments.len() as u16).to_le_bytes());
@@ -88,21 +92,24 @@ impl PlaybackLayer {
         let mut add = |name: String, bytes: Vec<u8>| out.push(Stream { name, bytes });
         add(ROWS.into(), gaps.into_iter().flat_map(u32::to_le_bytes).collect());
         for (k, (last, tracks)) in segments.iter().enumerate() {
+            checks.segment(*last)?;
             meta.extend((*last as u16).to_le_bytes());
             meta.push(tracks.len() as u8);
             for track in tracks {
+                checks.head(track.head)?;
+                checks.track(track)?;
                 meta.extend([Head::ALL.iter().position(|h| *h == track.head).unwrap_or(0) as u8, track.peaks.len() as u8]);
                 meta.extend(track.step.to_le_bytes());
                 meta.extend(track.peaks.iter().flat_map(|p| p.to_le_bytes()));
                 let name = |part: &str| format!("{PREFIX}{k}.{}.{part}", track.head.name());
                 let width = track.head.width(sh_degree);
-                coefficient_count(&track.ranks, width)?;
                 add(name("functions"), track.functions.iter().flat_map(|v| v.to_le_bytes()).collect());
                 add(name("ranks"), track.ranks.clone());
                 add(name("exponents"), track.ranks.iter().zip(&track.exponents).filter(|(rank, _)| **rank > 0).map(|(_, e)| *e).collect());
                 add(name("coefficients"), CodedTrack::order(&track.ranks, width).flat_map(|i| zigzag(track.coefficients[i]).to_le_bytes()).collect());
             }
         }
+        checks.finish()?;
         out.insert(0, Stream { name: META.into(), bytes: meta });
         Ok(out)
     }
@@ -122,37 +129,34 @@ impl PlaybackLayer {
         }
         let degree = usize::from(meta.u8()?);
         let (samples, segment_count, m) = (usize::from(meta.u16()?), usize::from(meta.u16()?), meta.u32()? as usize);
-        if degree != sh_degree || m > count || samples == 0 || samples > MAX_SAMPLES || segment_count == 0 || segment_count > MAX_SEGMENTS {
-            return Err(meta.error(format!(
-                "{m} moving Gaussians of degree {degree}, {samples} samples and {segment_count} segments do not fit {count} Gaussians of degree {sh_degree}"
-            )));
+        if degree != sh_degree || m > count {
+            return Err(meta.error(format!("{m} moving Gaussians of degree {degree} do not fit {count} Gaussians of degree {sh_degree}")));
         }
+        let refuse = |problem: String| Error::data("playback layer", problem, "Bake the archive again");
+        let mut checks = Checks::new(samples, segment_count, m, sh_degree, refuse)?;
         let rows = read_rows(reader(ROWS)?, m, count)?;
         let (mut segments, mut first) = (Vec::new(), 0usize);
         for k in 0..segment_count {
             let (last, track_count) = (usize::from(meta.u16()?), usize::from(meta.u8()?));
-            if last >= samples || (last <= first && samples > 1) || track_count > Head::ALL.len() {
-                return Err(meta.error(format!("segment {k} ends at sample {last} of {samples} and has {track_count} tracks")));
-            }
+            let samples = checks.segment(last)?;
             let mut tracks: Vec<Track> = Vec::new();
             for _ in 0..track_count {
                 let code = meta.u8()?;
-                let Some(head) = Head::ALL.get(usize::from(code)).copied().filter(|h| tracks.last().is_none_or(|t| t.head < *h)) else {
-                    return Err(meta.error(format!("head {code} of segment {k} is unknown or out of order")));
+                let Some(head) = Head::ALL.get(usize::from(code)).copied() else {
+                    return Err(meta.error(format!("head {code} of segment {k} is unknown")));
                 };
+                checks.head(head)?;
                 let functions = usize::from(meta.u8()?);
                 let step = meta.f32()?;
                 let peaks = meta.f32s(functions)?;
                 let part = |part: &str| reader(&format!("{PREFIX}{k}.{}.{part}", head.name()));
-                let shape = TrackShape { head, width: head.width(sh_degree), functions, samples: last - first + 1, m };
-                tracks.push(shape.read(step, peaks, part, limits)?);
+                let shape = TrackShape { head, width: head.width(sh_degree), functions, samples, m };
+                tracks.push(checks.track(&shape.read(step, peaks, part, limits)?)?);
             }
             segments.push(Segment { first, last, tracks });
             first = last;
         }
-        if first + 1 != samples {
-            return Err(meta.error(format!("its segments end at sample {first} of {samples}")));
-        }
+        checks.finish()?;
         meta.finish()?;
         Ok(Self { rows, samples, sh_degree, segments })
     }
@@ -182,24 +186,18 @@ struct TrackShape {
 }
 
 impl TrackShape {
-    fn read<'a>(&self, step: f32, peaks: Vec<f32>, part: impl Fn(&str) -> Result<ByteReader<'a>>, limits: &Limits) -> Result<Track> {
+    fn read<'a>(&self, step: f32, peaks: Vec<f32>, part: impl Fn(&str) -> Result<ByteReader<'a>>, limits: &Limits) -> Result<CodedTrack> {
         let mut reader = part("functions")?;
         let bytes = reader.take(2 * self.functions * self.samples)?;
         let functions: Vec<i16> = bytes.as_chunks::<2>().0.iter().map(|b| i16::from_le_bytes(*b)).collect();
         reader.finish()?;
         let mut reader = part("ranks")?;
         let ranks = reader.take(self.m)?.to_vec();
-        if ranks.iter().copied().max().map_or(0, usize::from) != self.functions {
-            return Err(reader.error(format!("no Gaussian uses exactly the {} functions there are", self.functions)));
-        }
         reader.finish()?;
         let (users, total) = (ranks.iter().filter(|r| **r > 0).count(), coefficient_count(&ranks, self.width)?);
         limits.check_bytes("coefficients of the playback layer", 4 * total as u64)?;
         let mut reader = part("exponents")?;
         let mut stored = reader.take(users)?.iter();
-        if let Some(e) = stored.clone().find(|e| **e > MAX_EXPONENT) {
-            return Err(reader.error(format!("an exponent is {e}, over {MAX_EXPONENT}")));
-        }
         let exponents = ranks.iter().map(|r| if *r > 0 { stored.next().copied().unwrap_or(0) } else { 0 }).collect();
         reader.finish()?;
         let mut reader = part("coefficients")?;
@@ -209,12 +207,7 @@ impl TrackShape {
             coefficients[i] = unzigzag(u32::from_le_bytes(*word));
         }
         reader.finish()?;
-        let track = CodedTrack { head: self.head, peaks, functions, ranks, step, exponents, coefficients }.decoded(self.width);
-        // A product of finite numbers may overflow.
-        match track.impossible() {
-            Some(v) => Err(Error::data("playback layer", format!("a coefficient or function of {} is {v}", self.head.name()), "Bake the archive again")),
-            None => Ok(track),
-        }
+        Ok(CodedTrack { head: self.head, peaks, functions, ranks, step, exponents, coefficients })
     }
 }
 

@@ -39,31 +39,70 @@ impl PartialLoss {
 /// [`relative_rms`] of the values between the 5th and the 95th percentile of each component of `rows` `[N,width]`, in deviations from the mean of that
 /// component. Outliers, and components around different means, enlarge the standard deviation of a column and would hide the errors of the other values.
 pub fn central_loss(rows: &[f32], decoded: &[f32], width: usize) -> f64 {
-    if rows.len() != decoded.len() {
-        return f64::NAN;
+    CentralLoss::new(rows, width).of(rows, decoded)
+}
+
+/// What [`central_loss`] knows of a column before it is decoded: of each component the 5th and the 95th percentile, and the values between them.
+#[derive(Clone, Debug)]
+struct CentralLoss {
+    width: usize,
+    components: Vec<(f32, f32, PartialLoss)>,
+}
+
+impl CentralLoss {
+    fn new(rows: &[f32], width: usize) -> Self {
+        let component = |component: usize| {
+            let values = || rows.iter().skip(component).step_by(width).copied();
+            let mut ordered: Vec<f32> = values().collect();
+            let (last, cut) = (ordered.len().checked_sub(1)?, ordered.len() / 20);
+            let low = *ordered.select_nth_unstable_by(cut, f32::total_cmp).1;
+            let high = *ordered.select_nth_unstable_by(last - cut, f32::total_cmp).1;
+            let inner: Vec<f32> = values().filter(|v| (low..=high).contains(v)).collect();
+            Some((low, high, PartialLoss::new(&inner)))
+        };
+        Self { width, components: (0..width).filter_map(component).collect() }
     }
-    let (mut sums, mut count) = ([0.0f64; 2], 0usize);
-    for component in 0..width {
-        let of = |rows: &[f32]| rows.iter().skip(component).step_by(width).copied().collect::<Vec<f32>>();
-        let (values, decoded) = (of(rows), of(decoded));
-        let Some(last) = values.len().checked_sub(1) else { continue };
-        let (mut ordered, cut) = (values.clone(), values.len() / 20);
-        let low = *ordered.select_nth_unstable_by(cut, f32::total_cmp).1;
-        let high = *ordered.select_nth_unstable_by(last - cut, f32::total_cmp).1;
-        let (inner, inner_decoded): (Vec<f32>, Vec<f32>) = values.iter().zip(&decoded).filter(|(v, _)| (low..=high).contains(*v)).unzip();
-        sums.iter_mut().zip(squares(&inner, &inner_decoded)).for_each(|(sum, of_component)| *sum += of_component);
-        count += inner.len();
+    fn of(&self, rows: &[f32], decoded: &[f32]) -> f64 {
+        if rows.len() != decoded.len() {
+            return f64::NAN;
+        }
+        let (mut sums, mut count) = ([0.0f64; 2], 0usize);
+        for (component, (low, high, inner)) in self.components.iter().enumerate() {
+            let pairs = rows.iter().zip(decoded).skip(component).step_by(self.width).filter(|(v, _)| (low..=high).contains(v));
+            sums[0] += pairs.fold(0.0, |sum, (a, b)| sum + (f64::from(*a) - f64::from(*b)).powi(2));
+            sums[1] += inner.deviation;
+            count += inner.count;
+        }
+        ratio(sums, count)
     }
-    ratio(sums, count)
 }
 
 /// What the column `name` of Gaussians lost: [`relative_rms`], and for centres [`central_loss`] where it is larger. A few Gaussians far away must not hide the
 /// errors of all others.
 pub fn column_loss(name: &str, rows: &[f32], decoded: &[f32], width: usize) -> f64 {
-    let whole = relative_rms(rows, decoded);
-    let central = if name == "means" { central_loss(rows, decoded, width) } else { 0.0 };
-    // NaN stays.
-    if central > whole { central } else { whole }
+    ColumnLoss::new(name, rows, width).of(rows, decoded)
+}
+
+/// [`column_loss`] of a column that is decoded again and again: what its values alone decide is computed once.
+#[derive(Clone, Debug)]
+pub struct ColumnLoss {
+    whole: PartialLoss,
+    central: Option<CentralLoss>,
+}
+
+impl ColumnLoss {
+    /// Of the column `name` of Gaussians, with the values `rows` `[N,width]`.
+    pub fn new(name: &str, rows: &[f32], width: usize) -> Self {
+        Self { whole: PartialLoss::new(rows), central: (name == "means").then(|| CentralLoss::new(rows, width)) }
+    }
+    /// What the same `rows` lose where they become `decoded`.
+    pub fn of(&self, rows: &[f32], decoded: &[f32]) -> f64 {
+        let (mut whole, central) = (self.whole, self.central.as_ref().map_or(0.0, |central| central.of(rows, decoded)));
+        whole.add(rows, decoded);
+        let whole = whole.loss();
+        // NaN stays.
+        if central > whole { central } else { whole }
+    }
 }
 
 /// The sums of squared errors and of squared deviations from the mean.

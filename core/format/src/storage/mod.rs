@@ -5,7 +5,7 @@
 //! * [`extra_streams`], [`Shape::read_extra`]: the extra attributes of plug-ins, bit for bit or within their tolerance, in the rows that are needed.
 //! * [`mod@column`], [`store`], [`load`], [`split`], [`interleave`], [`skip`]: columns of codes with few bits, outliers stored exactly in a separate list.
 //! * [`to_planes`], [`from_planes`]: float32 values, column by column.
-//! * [`relative_rms`], [`column_loss`], [`PartialLoss`]: what rounding loses.
+//! * [`relative_rms`], [`column_loss`], [`ColumnLoss`], [`PartialLoss`]: what rounding loses.
 //! * [`write_shapes`], [`read_shapes`]: names and shapes of a deformer's weights.
 //!
 //! The smallest lossless codec:
@@ -45,7 +45,7 @@ mod shapes;
 mod streams;
 
 pub use extra::{Attributes, extra_streams};
-pub use loss::{PartialLoss, central_loss, column_loss, relative_rms};
+pub use loss::{ColumnLoss, PartialLoss, central_loss, column_loss, relative_rms};
 pub use rows::{interleave, load, skip, split, store};
 pub use shapes::{read_shapes, value_count, write_shapes};
 pub use streams::{ESCAPES, HARMONICS, META, Shape, StreamSet, assemble, close, from_planes, open, stage_of_column, to_planes};
