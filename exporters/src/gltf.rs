@@ -163,7 +163,7 @@ inventory::submit! {
             summary: "binary glTF with KHR_gaussian_splatting",
             paper: "KHR_gaussian_splatting (Khronos Group 2025), extension of glTF 2.0",
             schema: SCHEMA,
-            capabilities: &["still"],
+            capabilities: &["still", "up"],
         },
         target: ExportTarget::File("glb"),
         build,

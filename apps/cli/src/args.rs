@@ -25,7 +25,7 @@ const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out 
 #[derive(Debug, Parser)]
 #[command(name = "cc4dgs", version, about, after_help = EXIT_CODES, subcommand_precedence_over_arg = true, arg_required_else_help = true)]
 pub struct Cli {
-    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE. An existing FILE is replaced if it is such a result.
+    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE. An earlier result in FILE is removed before the command begins; any other FILE is refused.
     #[arg(long, global = true, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
     /// Print results and errors only.
@@ -226,9 +226,9 @@ pub struct Report {
     /// Whose images the page contains, where the folder has them.
     #[arg(long, value_enum, default_value_t = ImagesArg::BuiltIn)]
     pub images: ImagesArg,
-    /// Views per scene to show images of.
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..=100))]
-    pub views: u16,
+    /// Views per scene to show images of [default: 3].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=100))]
+    pub views: Option<u16>,
     /// Only results with this scene, method, setting, codec, seed, device, adapter, processor, threads or split; may be given several times.
     #[arg(long = "where", value_name = "KEY=VALUE")]
     pub only: Vec<String>,

@@ -1,17 +1,22 @@
-//! Ctrl-C: the first asks the running work to stop at a safe point, the second ends the process at once.
+//! Ctrl-C and SIGTERM: the first asks the running work to stop at a safe point, one that comes more than a second later ends the process at once.
 
 use cc4dgs_core::{Error, Result};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
+/// Signals that come so soon after the first are the same request: `timeout` and job managers send one to a process and one to the group that it is in.
+const SAME_REQUEST: Duration = Duration::from_secs(1);
 static STOP: AtomicBool = AtomicBool::new(false);
 static INSTALLED: OnceLock<Result<(), String>> = OnceLock::new();
 
 /// Installs the handler (once per process) and returns the flag it sets.
 pub fn stop_flag() -> Result<&'static AtomicBool> {
     let installed = INSTALLED.get_or_init(|| {
-        ctrlc::set_handler(|| {
-            if STOP.swap(true, Ordering::SeqCst) {
+        let mut first = None;
+        ctrlc::set_handler(move || {
+            STOP.store(true, Ordering::SeqCst);
+            if first.get_or_insert_with(Instant::now).elapsed() > SAME_REQUEST {
                 std::process::exit(130);
             }
         })

@@ -9,6 +9,7 @@
 
 mod args;
 mod commands;
+mod ignored;
 mod interrupt;
 mod listeners;
 mod models;
@@ -37,7 +38,7 @@ where
         }
     };
     let output = output::Output::new(cli.json.clone(), cli.quiet);
-    match output.check().and_then(|()| commands::dispatch(&cli, &output)) {
+    match output.begin().and_then(|()| commands::dispatch(&cli, &output)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             output.failure(&error);

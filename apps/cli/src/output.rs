@@ -32,9 +32,15 @@ impl Output {
     pub fn json_file(&self) -> Option<&Path> {
         self.json.as_deref().filter(|p| p.as_os_str() != "-")
     }
-    /// Refuses a file for the JSON that exists and is no result of this program. Call it before long work.
-    pub fn check(&self) -> Result<()> {
-        self.json_file().map_or(Ok(()), |file| refuse_other_content(file, "a result that --json wrote", is_result))
+    /// Refuses a file for the JSON that exists and is no result of this program, and removes an earlier result: a command that fails would leave it in the place
+    /// of its own. Call it before any work.
+    pub fn begin(&self) -> Result<()> {
+        let Some(file) = self.json_file() else { return Ok(()) };
+        refuse_other_content(file, "a result that --json wrote", is_result)?;
+        match std::fs::remove_file(file) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(file, e)),
+            _ => Ok(()),
+        }
     }
     /// Reports a result: as JSON where `--json` says, and as `text` on standard output unless the JSON went there.
     pub fn result(&self, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<()> {
@@ -158,20 +164,21 @@ mod tests {
     fn json_replaces_results_only() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("out");
-        let check = |file: &Path| Output::new(Some(file.to_path_buf()), true).check();
-        check(&file).unwrap();
+        let begin = |file: &Path| Output::new(Some(file.to_path_buf()), true).begin();
+        begin(&file).unwrap();
         let own = "\n{\"cc4dgs\":\"0.0.9\"}";
         let others = ["{}\n", "\n [1]", "{\"frames\": []}", "{\"frames\": [{\"cc4dgs\": \"1\"}]}", "\u{89}PNG", "name = 'grid'"];
         for (content, accepted) in [("", true), (own, true)].into_iter().chain(others.map(|content| (content, false))) {
             std::fs::write(&file, content).unwrap();
-            assert_eq!(check(&file).is_ok(), accepted, "{content}");
+            assert_eq!(begin(&file).is_ok(), accepted, "{content}");
+            assert_ne!(file.exists(), accepted, "{content}: earlier results are removed, and nothing else");
         }
-        let message = check(&file).unwrap_err().to_string();
+        let message = begin(&file).unwrap_err().to_string();
         assert!(
             ["not a result that --json wrote", "another name, or remove it", file.to_str().unwrap()].iter().all(|part| message.contains(part)),
             "{message}"
         );
-        assert!(check(folder.path()).is_err());
+        assert!(begin(folder.path()).is_err() && folder.path().is_dir());
         // What is written may be written again.
         let object = serde_json::json!({ "scores": [{ "psnr_db": 30.5 }], "text": "a\n  {\nb" });
         for (value, pointer) in [(object.clone(), ""), (serde_json::json!([object, object]), "/1")] {
@@ -181,9 +188,10 @@ mod tests {
             assert_eq!((mark, text.matches("\"cc4dgs\"").count()), (Some(env!("CARGO_PKG_VERSION")), if pointer.is_empty() { 1 } else { 2 }), "{text}");
             assert_eq!(read.pointer(&format!("{pointer}/text")), Some(&object["text"]));
             std::fs::write(&file, text).unwrap();
-            check(&file).unwrap();
+            begin(&file).unwrap();
+            assert!(!file.exists());
         }
-        check(Path::new("-")).unwrap();
-        Output::new(None, true).check().unwrap();
+        begin(Path::new("-")).unwrap();
+        Output::new(None, true).begin().unwrap();
     }
 }

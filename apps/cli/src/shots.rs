@@ -2,6 +2,7 @@
 
 use crate::args::Shots;
 use crate::commands::Context;
+use crate::ignored::{Stated, refuse_ignored, written};
 use cc4dgs::Orbit;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::sample::spread_views;
@@ -20,12 +21,12 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model, i
         }
         let standard = Orbit::default();
         let frames = args.frames.map_or(standard.frames, |n| n as usize);
-        let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns, up: args.up.into() };
+        let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns(), up: args.up().into() };
         let cameras = orbit.around(&model.gaussians)?;
         return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, orbit.time(i))).collect(), None));
     };
     let scene = open_as_trained(path, model, sets, &context.registry, &context.limits)?;
-    let views = scene.split(args.split.into());
+    let views = scene.split(args.split().into());
     if views.is_empty() && images {
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
     }
@@ -35,6 +36,12 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model, i
         (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[view].time_norm)
     };
     Ok((spread_views(&scene, &views, wanted).into_iter().map(shot).collect(), scene.background))
+}
+
+/// Refuses the upward axis of an orbit beside the cameras of a dataset.
+pub fn check_up(args: &Shots) -> Result<()> {
+    let (value, remedy) = (args.up.as_ref().map(written), "Leave one of the two out: it is the axis of an orbit".into());
+    refuse_ignored("the cameras of --scene", [Stated { option: "--up", value, used: args.scene.is_none(), remedy }])
 }
 
 /// The cameras that recorded the dataset at `path`, as `model` was trained on them with scene options `sets` laid over: those of the training views, each once.

@@ -62,10 +62,17 @@ fn mistakes_end_with_their_own_exit_code() {
     for (args, part) in [
         ("decompress x --no-dynamic --out y.spz", "name a file that ends in .ply"),
         ("export ply x --frames 3 --out y.ply", "ply-sequence"),
-        ("export sog x --fps 3 --out y.sog", "sog holds one instant"),
-        ("export splatv x --frames 3 --out y.splatv", "splatv holds the whole time"),
-        ("export ply-sequence x --fps 3 --out y", "how fast it is played"),
+        ("export sog x --fps 3 --out y.sog", "--fps 3: it has no effect on the format sog"),
+        ("export splatv x --frames 3 --out y.splatv", "--frames 3: it has no effect on the format splatv"),
+        ("export ply-sequence x --fps 3 --out y", "mp4, web"),
+        ("export ply x --scene y --out y.ply", "--scene y: it has no effect on the format ply"),
+        ("export ply x --set scene.width=8 --out y.ply", "--set scene.width=8: it has no effect on the format ply"),
         ("render x --fps 3 --out y", "--mp4"),
+        ("render x --scene y --up=-x --out z", "--up -x: it has no effect on the cameras of --scene"),
+        ("report x --images none --views 3", "--views 3: it has no effect on a page without images"),
+        ("sweep run x --no-wait", "--index"),
+        ("train --scene procedural:tiny --device flex --set device=wgpu --out y", "--set device=wgpu: it has no effect on a command with --device"),
+        ("demo --limit max_depth=9 --set limits.max_depth=8 --out y", "--set limits.max_depth=8: it has no effect on a command with --limit max_depth=9"),
         ("eval x --scene y --sheet a.png --sheet-rows 0", "--sheet a.png: --sheet-rows 0 draws"),
         ("compress x --codec kwantize --out y.cc4d", "quantize"),
         ("compress x --codec raw --set bitz=3 --out y.cc4d", "bitz"),
@@ -93,6 +100,12 @@ fn mistakes_end_with_their_own_exit_code() {
     let output = run(&["info", text(&broken), "--json"]);
     let object: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((output.status.code(), &object["error"]["exit_code"]), (Some(3), &Value::from(3)));
+    // What an earlier command found is not taken for the result of one that failed.
+    let file = folder.path().join("earlier.json");
+    succeed(&["plugins", "cdf", "-q", "--json", text(&file)]);
+    assert!(file.is_file());
+    fail(&["info", text(&broken), "--json", text(&file)], 3);
+    assert!(!file.exists());
 }
 
 #[test]
@@ -330,7 +343,9 @@ fn an_interrupted_run_resumes_to_the_same_bytes() {
             assert!(began.elapsed() < Duration::from_secs(120), "no iteration within two minutes");
             std::thread::sleep(Duration::from_millis(5));
         }
-        let sent = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
+        // Twice, as by `timeout`, which signals its child and then the group that it is in.
+        let send = format!("kill {signal} {0} && sleep 0.02 && kill {signal} {0}", child.id());
+        let sent = Command::new("sh").args(["-c", &send]).status().unwrap();
         assert!(sent.success(), "the training ended before it was interrupted");
         let output = child.wait_with_output().unwrap();
         assert_eq!(output.status.code(), Some(130), "{signal}: {}", String::from_utf8_lossy(&output.stderr));

@@ -150,7 +150,7 @@ inventory::submit! {
             summary: "moving Gaussians for splaTV and gsplat.js",
             paper: "splaTV (Kwok 2024), file format of Spacetime Gaussians (Li et al. 2024)",
             schema: SCHEMA,
-            capabilities: &["motion"],
+            capabilities: &["motion", "camera"],
         },
         target: ExportTarget::File("splatv"),
         build,

@@ -19,29 +19,28 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+/// Frames per second where nobody states them.
+const RATE: f64 = 30.0;
+/// The upward axis where nobody states it.
+const UP: [f64; 3] = [0.0, 0.0, 1.0];
+
 /// What to export of a model.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct ExportRequest {
-    /// The instant (0..1) that formats without motion hold; `None` is the canonical model. Formats with motion refuse one.
+    /// The instant (0..1) that formats of one instant hold; `None` is the canonical model. Other formats refuse one.
     pub time_norm: Option<f32>,
     /// Frames of formats that hold several; as many as the model was trained with where absent. Frame k of n is at time k / (n - 1).
     pub frames: Option<usize>,
-    /// Frames per second of videos.
-    pub frames_per_second: f64,
-    /// The signed unit axis of the world that points up.
-    pub up: [f64; 3],
+    /// Frames per second. Where absent: in formats with a player what the archive states, else 30.
+    pub frames_per_second: Option<f64>,
+    /// The signed unit axis of the world that points up. Where absent: in formats with a player what the archive states or the cameras show, else z.
+    pub up: Option<[f64; 3]>,
     /// Cameras (in the model's frame) and times of rendered images.
     pub shots: Vec<(Camera, f32)>,
     /// Background of rendered images where the model has none.
     pub background: Option<[f32; 3]>,
     /// Cameras of the recording, in the model's frame, for formats with a player.
     pub cameras: Vec<Camera>,
-}
-
-impl Default for ExportRequest {
-    fn default() -> Self {
-        Self { time_norm: None, frames: None, frames_per_second: 30.0, up: [0.0, 0.0, 1.0], shots: Vec::new(), background: None, cameras: Vec::new() }
-    }
 }
 
 /// An export to run.
@@ -107,7 +106,7 @@ impl ExportJob<'_> {
         let plugin = self.registry.exporter(self.format)?;
         let exporter = (plugin.build)(self.settings)?;
         check_time(self.registry, plugin, self.request.time_norm)?;
-        check_up(self.request.up)?;
+        self.request.up.map_or(Ok(()), check_up)?;
         let mut source = ModelSource::new(self)?;
         let lost = exporter.loses(source.facts());
         let (exported, bytes) = export(exporter.as_ref(), plugin.target, &mut source, self.out, self.overwrite)?;
@@ -127,7 +126,7 @@ impl ExportJob<'_> {
     }
 }
 
-/// Refuses an instant that is no time, or that a format which holds all times has no use for.
+/// Refuses an instant that is no time, or that a format which does not hold one instant has no use for.
 ///
 /// # Errors
 /// [`Error::Parameter`].
@@ -138,8 +137,12 @@ pub fn check_time(registry: &Registry, plugin: &ExporterPlugin, time_norm: Optio
         return refuse("it is not in 0..1".into(), "Give the normalised time, 0 for the first frame and 1 for the last");
     }
     let has = |capability| plugin.info.capabilities.contains(&capability);
-    let held = if has("motion") { "the whole motion" } else { "images of all times" };
-    if has("motion") || has("images") {
+    if !has("still") {
+        let held = match (has("motion"), has("images")) {
+            (true, _) => "the whole motion",
+            (false, true) => "images of all times",
+            (false, false) => "no single instant",
+        };
         let still: Vec<&str> = registry.exporters().filter(|p| p.info.capabilities.contains(&"still")).map(|p| p.info.name).collect();
         return refuse(format!("{} holds {held}", plugin.info.name), &format!("Leave it out, or choose a format of one instant: {}", still.join(", ")));
     }
@@ -191,7 +194,8 @@ impl<'a> ModelSource<'a> {
         // What stands still is the same in every frame.
         let all = if player.moving() == 0 { 1 } else { model.frame_count };
         let frames = request.frames.unwrap_or(all).max(1);
-        let orbit = Orbit { frames: 1, up: request.up, ..Orbit::default() };
+        let up = request.up.unwrap_or(UP);
+        let orbit = Orbit { frames: 1, up, ..Orbit::default() };
         // A camera is a convenience; models that no orbit can look at have none.
         let home = request.shots.first().map(|(camera, _)| camera.clone()).or_else(|| orbit.around(&model.gaussians).ok()?.pop());
         let facts = ExportFacts {
@@ -201,10 +205,10 @@ impl<'a> ModelSource<'a> {
             sh_degree: model.gaussians.sh_degree,
             time_norm: request.time_norm,
             times_norm: (0..frames).map(|k| frame_time(k, frames)).collect(),
-            frames_per_second: request.frames_per_second,
+            frames_per_second: request.frames_per_second.unwrap_or(RATE),
             antialiased: model.render.antialiased,
             blur: model.render.blur,
-            up: request.up,
+            up,
             home: home.map(|camera| model.normalisation.inverse().apply_camera(&camera)),
             images: request.shots.len(),
         };
@@ -249,11 +253,16 @@ impl ExportSource for ModelSource<'_> {
             None => Stored::of_model(model, Storage::default(), around)?,
         };
         self.check_stop("before baking the motion")?;
-        let up = request.cameras.is_empty().then_some(request.up);
-        let before = stored.presentation(&request.cameras, up)?;
-        let shown = if request.cameras.is_empty() { before.clone() } else { presented(&stored.model, &request.cameras, None)? };
-        let presentation =
-            Presentation { frames_per_second: before.frames_per_second.or(Some(request.frames_per_second as f32)), seconds: before.seconds, ..shown };
+        let before = stored.presentation(&request.cameras, request.up)?;
+        let shown = match (request.cameras.as_slice(), request.up) {
+            ([], None) => before.clone(),
+            ([], up) => presented(&stored.model, &before.cameras, up)?,
+            (cameras, up) => presented(&stored.model, cameras, up)?,
+        };
+        let rate = request.frames_per_second.map(|rate| rate as f32);
+        // The duration follows from a rate that is stated.
+        let seconds = before.seconds.filter(|_| rate.is_none());
+        let presentation = Presentation { frames_per_second: rate.or(before.frames_per_second).or(Some(RATE as f32)), seconds, ..shown };
         // A layer that is there was made with a bound of its own.
         let max_error = (stored.bytes_of(StreamKind::Playback) == 0).then_some(max_error);
         let options = PlayableOptions { max_error, cameras: &request.cameras, presentation, poster: true, without_field: true, baked };

@@ -57,22 +57,22 @@ pub struct Shots {
     /// Take the cameras and times of this dataset instead of an orbit around the model.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
-    /// Which side of the dataset's split; with --scene only.
-    #[arg(long, value_enum, default_value_t = SplitArg::Test, requires = "scene")]
-    pub split: SplitArg,
+    /// Which side of the dataset's split; with --scene only [default: test].
+    #[arg(long, value_enum, requires = "scene")]
+    pub split: Option<SplitArg>,
     /// Number of frames: of the orbit (60 by default); at most so many of the dataset, spread over cameras and frames (all by default); of ply-sequence (those of training by default).
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
     /// Image size in pixels; by default 800x600 for an orbit, for datasets their own.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<(u32, u32)>,
-    /// Full turns of the orbit while time runs from 0 to 1.
-    #[arg(long, value_name = "TURNS", default_value_t = 1.0, conflicts_with = "scene")]
-    pub turns: f64,
-    /// The axis of the world that points up, for the orbit and for gltf.
-    #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
-    pub up: UpArg,
-    /// Frames per second of a video, such as 29.97, and of a page where the model states none [default: 30].
+    /// Full turns of the orbit while time runs from 0 to 1 [default: 1].
+    #[arg(long, value_name = "TURNS", conflicts_with = "scene")]
+    pub turns: Option<f64>,
+    /// The axis of the world that points up, for an orbit, for gltf, and for a page in place of what the model states [default: z].
+    #[arg(long, value_enum, allow_hyphen_values = true)]
+    pub up: Option<UpArg>,
+    /// Frames per second of a video, such as 29.97, and of a page in place of what the model states [default: 30].
     #[arg(long, value_name = "N", value_parser = parse_rate)]
     pub fps: Option<f64>,
 }
@@ -81,6 +81,18 @@ impl Shots {
     /// Frames per second.
     pub fn rate(&self) -> f64 {
         self.fps.unwrap_or(30.0)
+    }
+    /// Side of the dataset's split.
+    pub fn split(&self) -> SplitArg {
+        self.split.unwrap_or(SplitArg::Test)
+    }
+    /// Full turns of the orbit.
+    pub fn turns(&self) -> f64 {
+        self.turns.unwrap_or(1.0)
+    }
+    /// The axis that points up.
+    pub fn up(&self) -> UpArg {
+        self.up.unwrap_or(UpArg::Z)
     }
 }
 

@@ -52,19 +52,19 @@ pub struct SweepRun {
     #[arg(long, value_name = "P", conflicts_with_all = ["cell", "index"], value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub jobs: Option<u64>,
     /// Run one cell, and its training if that is missing.
-    #[arg(long, value_name = "ID", conflicts_with = "index")]
+    #[arg(long, value_name = "ID", conflicts_with = "index", group = "one")]
     pub cell: Option<String>,
     /// Run the I-th training, from 0, with all of its cells.
-    #[arg(long, value_name = "I")]
+    #[arg(long, value_name = "I", group = "one")]
     pub index: Option<usize>,
     /// Refuse to run if the folder has another plan by now, so that an index cannot mean another training; `sweep emit` writes it into job files.
     #[arg(long, value_name = "ID", requires = "index")]
     pub plan: Option<String>,
     /// Leave a training that another process works on (exit code 75) instead of waiting.
-    #[arg(long, hide = true)]
+    #[arg(long, hide = true, requires = "one")]
     pub no_wait: bool,
     /// Processes that share the memory of this machine, this one included.
-    #[arg(long, hide = true, value_name = "N", default_value_t = 1)]
+    #[arg(long, hide = true, value_name = "N", default_value_t = 1, requires = "one")]
     pub processes: usize,
 }
 

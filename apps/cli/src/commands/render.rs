@@ -2,6 +2,7 @@
 
 use super::{Context, create_parent, image_folder};
 use crate::args::Render;
+use crate::ignored::{Stated, refuse_ignored};
 use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::video::{self, VideoWriter};
@@ -34,9 +35,10 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
         // Before any frame: an hour of rendering should not end in a missing program.
         video::ffmpeg_version()?;
         refuse_existing(path, args.overwrite)?;
-    } else if args.shots.fps.is_some() {
-        return Err(Error::parameter("--fps", "it is the rate of a video, and none is asked for", "Leave it out, or add --mp4 F.mp4"));
     }
+    let (value, remedy) = (args.shots.fps.map(|rate| rate.to_string()), "Leave it out, or add --mp4 F.mp4".into());
+    refuse_ignored("frames without a video", [Stated { option: "--fps", value, used: args.mp4.is_some(), remedy }])?;
+    shots::check_up(&args.shots)?;
     let earlier = earlier_frames(&args.out, args.overwrite)?;
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;

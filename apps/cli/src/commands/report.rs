@@ -2,10 +2,16 @@
 
 use super::{Context, megabytes};
 use crate::args::{ImagesArg, Report};
+use crate::ignored::{Stated, refuse_ignored};
 use cc4dgs_core::Result;
 use cc4dgs_train::report::{ImageChoice, ReportOptions, write_report};
 
+/// Views per scene that images are shown of, where it is not said.
+const VIEWS: u16 = 3;
+
 pub fn run(context: &Context, args: &Report) -> Result<()> {
+    let (value, remedy) = (args.views.map(|views| views.to_string()), "Leave it out, or choose other --images".into());
+    refuse_ignored("a page without images", [Stated { option: "--views", value, used: args.images != ImagesArg::None, remedy }])?;
     let images = match args.images {
         ImagesArg::None => ImageChoice::None,
         ImagesArg::BuiltIn => ImageChoice::BuiltIn,
@@ -14,7 +20,7 @@ pub fn run(context: &Context, args: &Report) -> Result<()> {
     let options = ReportOptions {
         title: args.title.clone(),
         images,
-        views: usize::from(args.views),
+        views: usize::from(args.views.unwrap_or(VIEWS)),
         only: args.only.clone(),
         columns: args.columns.clone(),
         figures: args.figures.clone(),

@@ -2,6 +2,7 @@
 
 use super::Context;
 use crate::args::Train;
+use crate::ignored::{Stated, refuse_ignored};
 use crate::interrupt;
 use cc4dgs::plugins;
 use cc4dgs::runs::{EVENTS, Existing, check_folder};
@@ -35,6 +36,7 @@ pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> 
     };
     // Without a word on settings, the scene is looked at.
     let preset = args.preset.as_deref().or((file.is_none()).then_some(auto::PRESET));
+    refuse_overruled(&args.sets, "auto.minutes", "--minutes", args.minutes.is_some())?;
     let minutes = args.minutes.map(|minutes| format!("auto.minutes={minutes}"));
     let sets: Vec<String> = args.sets.iter().cloned().chain(minutes).collect();
     let layers = layers(context, preset, file, &sets, args.device.as_deref())?;
@@ -59,10 +61,21 @@ pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> 
 
 /// Preset, file and overrides, with the device and the limits of the command line on top.
 pub fn layers(context: &Context, preset: Option<&str>, file: Option<&Path>, sets: &[String], device: Option<&str>) -> Result<Layers> {
+    refuse_overruled(sets, "device", "--device", device.is_some())?;
+    for limit in context.limit_options {
+        let name = limit.split_once('=').map_or(limit.as_str(), |(name, _)| name);
+        refuse_overruled(sets, &format!("limits.{}", name.trim()), &format!("--limit {limit}"), true)?;
+    }
     let limits = context.limit_options.iter().map(|option| format!("limits.{option}"));
     let device = device.map(|name| format!("device={}", resolved_device(name)));
     let sets: Vec<String> = sets.iter().cloned().chain(limits).chain(device).collect();
     Layers::collect(&context.registry, preset, file, &sets)
+}
+
+/// Refuses the setting `key` among `sets` where an option of the command line, `option`, is stated, which takes its place.
+fn refuse_overruled(sets: &[String], key: &str, option: &str, stated: bool) -> Result<()> {
+    let value = sets.iter().find(|set| set.split_once('=').is_some_and(|(name, _)| name.trim() == key)).cloned();
+    refuse_ignored(&format!("a command with {option}"), [Stated { option: "--set", value, used: !stated, remedy: "Leave one of the two out".into() }])
 }
 
 /// A training that ended.
@@ -108,4 +121,20 @@ pub fn text(report: &TrainReport) -> String {
         report.dynamic_gaussians,
         report.checkpoint.as_ref().map_or_else(String::new, |path| path.display().to_string())
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_an_option_replaces_are_refused() {
+        let refused = |sets: &[&str], stated| {
+            let sets: Vec<String> = sets.iter().map(ToString::to_string).collect();
+            refuse_overruled(&sets, "auto.minutes", "--minutes", stated).map_err(|error| error.to_string())
+        };
+        assert_eq!((refused(&["auto.minutes=3"], false), refused(&["auto.method=none", "seed=3"], true)), (Ok(()), Ok(())));
+        let message = refused(&["seed=3", "auto.minutes=3"], true).unwrap_err();
+        assert_eq!(message, "--set auto.minutes=3: it has no effect on a command with --minutes. Leave one of the two out");
+    }
 }

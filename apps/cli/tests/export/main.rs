@@ -123,7 +123,7 @@ fn exports_are_refused_before_work_and_never_replace_unasked() {
     assert!(refused(export("ply", &out, &["--set", "dynamics=false"])).contains("dynamics"));
     assert!(refused(export("ply", &out, &["--time", "1.5"])).contains("0..1"));
     let still = refused(export("splatv", &at("a.splatv"), &["--time", "0.5"]));
-    assert!(still.contains("whole motion") && still.contains("ply, sog, spz"), "{still}");
+    assert!(still.contains("--time 0.5: it has no effect on the format splatv") && still.contains("ply, sog, spz"), "{still}");
     assert!(!out.exists());
     std::fs::write(&out, "mine").unwrap();
     assert!(refused(export("ply", &out, &[])).contains("--overwrite"));
@@ -209,6 +209,16 @@ fn pages_hold_an_archive_that_plays() {
     export(&baked, &again);
     let layer = |path: &Path| cc4dgs_core::StoredModel::open(path, &cc4dgs::Limits::default(), &events).unwrap().playback;
     assert!(layer(&again.join("model.cc4d")) == layer(&baked) && layer(&baked) != model.playback);
+    // What is said of clock and axis takes the place of what the archive states.
+    succeed(&["bake", text(&dir), "--out", text(&at("slow.cc4d")), "--max-error", "2px", "--fps", "12", "--up", "z", "-q"]);
+    export(&at("slow.cc4d"), &at("slow"));
+    export_with(&at("slow.cc4d"), &at("fast"), &["--fps", "24", "--up", "y"]);
+    let [slow, fast] = ["slow", "fast"].map(|site| {
+        let archive = Archive::open(at(site).join("model.cc4d"), &cc4dgs::Limits::default()).unwrap();
+        archive.manifest().presentation.clone()
+    });
+    assert_eq!((slow.frames_per_second, slow.up, fast.frames_per_second, fast.up), (Some(12.0), Some([0.0, 0.0, 1.0]), Some(24.0), Some([0.0, 1.0, 0.0])));
+    assert!(slow.seconds.is_some() && fast.seconds.is_none(), "the duration of the archive is that of its rate");
     // Scene options count for the cameras of the page.
     export_with(&dir, &at("small"), &["--scene", "procedural:tiny", "--set", "scene.width=20"]);
     let small = cc4dgs_core::StoredModel::open(at("small/model.cc4d"), &cc4dgs::Limits::default(), &events).unwrap();

@@ -193,7 +193,7 @@ fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> 
     format!(
         r#"#!/bin/bash
 # {trainings} trainings, {cells} cells. Submit with: sbatch FILE. A task that is stopped before its time limit, or preempted, leaves a checkpoint and
-# is queued again; finished cells are never run twice.
+# is queued again; finished cells are never run twice. A task that is cancelled leaves a checkpoint, too, and is not queued again.
 #SBATCH --job-name={name}
 #SBATCH --array=0-{last}{throttle}
 #SBATCH --cpus-per-task={threads}
@@ -201,21 +201,24 @@ fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> 
 #SBATCH --time={minutes}
 #SBATCH --requeue
 #SBATCH --open-mode=append
-#SBATCH --signal=B:TERM@{NOTICE_SECONDS}
+#SBATCH --signal=B:USR1@{NOTICE_SECONDS}
 #SBATCH --output={output}
 set -u
 {variables}cd {cd} || exit 2
+# The notice before the time limit comes to this shell alone. Cancelling and preemption signal every process, the program too, and Slurm itself queues preempted
+# tasks again.
+work= notice=
+trap 'notice=yes; kill -TERM "$work" 2>/dev/null' USR1
+trap : TERM INT
 {program} --quiet --threads {threads} {limits}sweep run {folder} --plan {plan} --index "$SLURM_ARRAY_TASK_ID" &
 work=$!
-trap 'kill -TERM "$work" 2>/dev/null' TERM INT
-# A signal ends the first wait; the second one waits for the checkpoint.
-wait "$work"
-code=$?
+# A signal ends a wait. The last one finds the program ended, and has its exit code.
 while kill -0 "$work" 2>/dev/null; do
     wait "$work"
-    code=$?
 done
-if [ "$code" -eq {INTERRUPTED} ]; then
+wait "$work"
+code=$?
+if [ "$notice" ] && [ "$code" -eq {INTERRUPTED} ]; then
     scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}" || true
 fi
 exit "$code"

@@ -4,6 +4,7 @@ mod pool;
 
 use super::Context;
 use crate::args::{SchedulerArg, SweepCollect, SweepEmit, SweepPlan, SweepRun};
+use crate::ignored::{Stated, refuse_ignored, written};
 use crate::interrupt;
 use cc4dgs::plugins;
 use cc4dgs_core::{Error, Result, config};
@@ -11,7 +12,6 @@ use cc4dgs_train::sweep::{
     Busy, Collection, EmitOptions, Grid, Outcome, Plan, Scheduler, SweepFolder, Tables, TrainingState, Worker, collect as collect_results, emit as emit_file,
     run_training, select, summary, write_tables,
 };
-use clap::ValueEnum;
 use serde::Serialize;
 use std::path::Path;
 
@@ -176,16 +176,13 @@ struct EmitReport {
 
 /// Refuses options of other schedulers, which would have no effect.
 fn check_scheduler(args: &SweepEmit) -> Result<()> {
-    let named = |value: &SchedulerArg| value.to_possible_value().map_or_else(String::new, |value| value.get_name().to_string());
     let options =
         [("--image", &args.image, SchedulerArg::K8s), ("--claim", &args.claim, SchedulerArg::K8s), ("--bucket", &args.bucket, SchedulerArg::Skypilot)];
-    match options.into_iter().find(|(_, value, of)| value.is_some() && *of != args.scheduler) {
-        Some((option, value, of)) => {
-            let (object, own) = (format!("{option} {}", value.as_deref().unwrap_or_default()), named(&args.scheduler));
-            Err(Error::parameter(object, format!("it is an option of {}, and has no effect on jobs of {own}", named(&of)), "Leave it out"))
-        }
-        None => Ok(()),
-    }
+    let stated = options.map(|(option, value, of)| {
+        let (value, remedy) = (value.clone(), format!("Leave it out: it is an option of {}", written(&of)));
+        Stated { option, value, used: of == args.scheduler, remedy }
+    });
+    refuse_ignored(&format!("jobs of {}", written(&args.scheduler)), stated)
 }
 
 pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {

@@ -244,10 +244,11 @@ fn a_variable_that_is_not_unicode_is_not_called_absent() {
     assert!(message.contains("CC4DGS_DATA is not Unicode here") && message.contains("part") && !message.contains("not set"), "{message}");
 }
 
-/// The script as bash reads it, with a program that answers with its arguments, a variable and an exit code.
+/// The script as bash reads it, with a program that answers with its arguments, a variable and an exit code. Slurm's notice is a signal to the script alone; where
+/// a task is cancelled or preempted, the program gets one, too.
 #[cfg(unix)]
 #[test]
-fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
+fn the_slurm_script_is_bash_and_requeues_what_was_asked_to_stop_before_its_limit() {
     use std::os::unix::fs::PermissionsExt;
     use std::process::Command;
     let folder = tempfile::tempdir().unwrap();
@@ -258,8 +259,21 @@ fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
     };
     program("scontrol", &format!("echo \"$@\" >> {}", at("requeued").display()));
     let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap_or_default());
-    for (code, requeued) in [(0, ""), (6, ""), (i32::from(INTERRUPTED), "requeue 7_3\n")] {
-        program("it's the program", &format!("printf '%s\\n' \"$@\" \"$CC4DGS_DATA\" > {}\nexit {code}", at("arguments").display()));
+    let interrupted = i32::from(INTERRUPTED);
+    // Sends signals, and waits until it is asked to stop: by none or by two signals it ends with 1.
+    let signalled = |signals: &str| {
+        let wait = "for _ in $(seq 200); do [ $asked -gt 0 ] && break; sleep 0.05; done; sleep 0.3";
+        format!("asked=0; trap 'asked=$((asked + 1))' TERM\n{signals}\n{wait}\n[ $asked -eq 1 ] && exit {interrupted}\nexit 1")
+    };
+    for (end, code, requeued) in [
+        ("exit 0".to_string(), 0, ""),
+        ("exit 6".to_string(), 6, ""),
+        (signalled("kill -USR1 $PPID"), interrupted, "requeue 7_3\n"),
+        // Cancelled, which must not be undone, or preempted, where Slurm itself queues the task again.
+        (signalled("kill -TERM $PPID $$"), interrupted, ""),
+    ] {
+        std::fs::remove_file(at("requeued")).ok();
+        program("it's the program", &format!("printf '%s\\n' \"$@\" \"$CC4DGS_DATA\" > {}\n{end}", at("arguments").display()));
         let options = EmitOptions {
             program: at("it's the program").display().to_string(),
             working_folder: folder.path().display().to_string(),
