@@ -22,7 +22,7 @@ pub struct Content {
     pub frame_count: usize,
     /// Whether the model moves, but the file has no playback layer: it is shown as it stands.
     pub lacks_motion: bool,
-    /// What the file holds and is not shown, a sentence each.
+    /// What the file holds and is not shown, a sentence or two each.
     pub remarks: Vec<String>,
     /// Size of the file in bytes.
     pub bytes: u64,
@@ -86,7 +86,18 @@ impl Content {
         scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(rules.near()).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
         let frame_count = if moves { manifest.frame_count } else { 1 };
-        Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, remarks: Vec::new(), bytes })
+        let still = "This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d";
+        let remarks = lacks_motion.then(|| still.to_string()).into_iter().collect();
+        Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, remarks, bytes })
+    }
+    /// Leaves out the highest degrees of the spherical harmonics until the rest take at most `most_words` 32-bit numbers: what one array of a device holds.
+    /// `remarks` say so then: what has no room for more (`room`), and what shows all degrees (`remedy`, a sentence without its full stop).
+    pub fn fit_harmonics(&mut self, most_words: u64, room: &str, remedy: &str) {
+        self.scene.fit_harmonics(most_words);
+        let (drawn, stored) = (self.scene.drawn_degree, self.scene.sh_degree);
+        if drawn < stored {
+            self.remarks.push(format!("Spherical harmonics are shown up to degree {drawn} of {stored}: more do not fit into {room}. {remedy}."));
+        }
     }
     /// The small image to show while the rest is fetched, PNG or JPEG bytes, if the archive has one.
     ///
@@ -102,8 +113,9 @@ mod tests {
     use super::*;
     use crate::Navigator;
     use crate::scene::tests::three;
-    use cc4dgs_format::HostGaussians;
+    use cc4dgs_format::archive::{CodecEntry, DeformerEntry, Manifest};
     use cc4dgs_format::spz::SpzOptions;
+    use cc4dgs_format::{DeformerContext, HostGaussians, Moving, Seed};
 
     #[test]
     fn extensions_of_spz_files_that_are_not_read_are_said() {
@@ -115,6 +127,33 @@ mod tests {
         let said = remarks(&bytes);
         assert!(said.len() == 1 && said[0].starts_with("a.spz: vendor extensions are not read") && said[0].ends_with('.'), "{said:?}");
         assert!(remarks(&ply::to_bytes(&three(0), false).unwrap()).is_empty());
+    }
+
+    #[test]
+    fn degrees_that_a_device_has_no_room_for_are_left_out_and_said() {
+        let content = |most_words: u64| {
+            let mut content = Content::read("t", ply::to_bytes(&three(3), false).unwrap(), &Limits::default()).unwrap();
+            content.fit_harmonics(most_words, "a buffer", "Use another device");
+            (content.scene.drawn_degree, content.remarks)
+        };
+        // Three Gaussians of 23 words each.
+        assert_eq!(content(69), (3, Vec::new()));
+        let said = "Spherical harmonics are shown up to degree 2 of 3: more do not fit into a buffer. Use another device.";
+        assert_eq!(content(68), (2, vec![said.to_string()]));
+    }
+
+    #[test]
+    fn models_that_move_and_have_no_layer_say_so() {
+        let context = DeformerContext { box_min: [0.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: 0, seed: Seed::root(0) };
+        let deformer = DeformerEntry { name: "d".into(), version: "1".into(), settings: Default::default(), context, weights: CodecEntry::default() };
+        let manifest = Manifest { deformer: Some(deformer), ..Default::default() };
+        let remarks = |moving: Moving| {
+            let model = StoredModel { manifest: manifest.clone(), gaussians: three(0), moving, playback: None };
+            Content::of_model(model, 0).unwrap().remarks
+        };
+        assert!(remarks(Moving::Nothing).is_empty());
+        let said = remarks(Moving::Everything);
+        assert!(said.len() == 1 && said[0].contains("no playback layer"), "{said:?}");
     }
 
     #[test]

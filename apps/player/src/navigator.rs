@@ -3,6 +3,7 @@
 use cc4dgs_format::Camera;
 use cc4dgs_format::archive::Presentation;
 use glam::{DMat3, DVec3};
+use std::ops::RangeInclusive;
 
 /// Full horizontal angle where no camera says another, in radians.
 const FOV_X: f64 = 0.9;
@@ -12,6 +13,10 @@ const ASPECT: f64 = 4.0 / 3.0;
 const POLE: f64 = 0.03;
 /// Nearest to the target that zooming comes, as a share of [`Navigator::unit`]: much nearer, rounding would turn the view, and stop zooming out.
 const NEAREST: f64 = 1e-6;
+/// Full vertical angles that a pose may have, in radians: from telescopes to nearly half of all directions.
+pub(crate) const POSE_FOV: RangeInclusive<f64> = 1e-9..=3.1;
+/// Below this angle in radians a link writes more decimals of eye and target: a millionth of their distance would be seen.
+const NARROW: f64 = 0.01;
 
 /// A free camera with a point that it orbits.
 #[derive(Clone, Debug, PartialEq)]
@@ -159,18 +164,20 @@ impl Navigator {
         (7..=8).contains(&numbers.len()).then(|| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(0.0)))
     }
     /// `pose` as links and commands have it: numbers with commas between, eight where there is a roll, else seven. Positions are right to a millionth of the
-    /// distance between eye and target, however far from the origin they are.
+    /// distance between eye and target, however far from the origin they are, or of views narrower than 0.01 to a ten-thousandth of what is seen at the target.
     pub fn pose_text(pose: [f64; 8]) -> String {
         let distance = (0..3).map(|axis| (pose[axis] - pose[axis + 3]).powi(2)).sum::<f64>().sqrt();
-        let decimals = (6.0 - distance.log10().floor()).clamp(0.0, 17.0) as usize;
-        let text: Vec<String> = pose.iter().enumerate().map(|(k, &v)| rounded(v, if k < 6 { decimals } else { 7 })).collect();
+        let decimals = |size: f64, least: f64| (6.0 - size.log10().floor()).clamp(least, 17.0) as usize;
+        let (positions, angle) = (decimals(distance * (pose[6] / NARROW).min(1.0), 0.0), decimals(pose[6], 7.0));
+        let places = [positions, positions, positions, positions, positions, positions, angle, 7];
+        let text: Vec<String> = pose.iter().zip(places).map(|(&v, places)| rounded(v, places)).collect();
         let shown = if text[7] == "0" { 7 } else { 8 };
         text[..shown].join(",")
     }
     /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored. Returns whether it was taken.
     pub fn set_pose(&mut self, pose: [f64; 8]) -> bool {
         let (eye, target) = (DVec3::new(pose[0], pose[1], pose[2]), DVec3::new(pose[3], pose[4], pose[5]));
-        let sees = pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && (0.01..3.1).contains(&pose[6]);
+        let sees = pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && POSE_FOV.contains(&pose[6]);
         if sees {
             (self.eye, self.target, self.fov_y, self.roll) = (eye, target, pose[6], pose[7]);
         }
@@ -305,6 +312,24 @@ mod tests {
         let (wanted, found) = (start.camera(640, 480).world_to_camera, linked.camera(640, 480).world_to_camera);
         let far = wanted.iter().flatten().zip(found.iter().flatten()).fold(0.0f64, |worst, (a, b)| worst.max((a - b).abs()));
         assert!(far < 1e-4, "the link turns the view by {far}");
+    }
+
+    #[test]
+    fn links_keep_the_views_of_very_long_focal_lengths() {
+        for fov_x in [0.012, 1e-3, 2e-6] {
+            let home = Camera::look_at("far", (640, 480), fov_x, [3000.0, 1000.0, 2000.0], [0.2, 0.1, 0.3], [0.0, 0.0, 1.0]);
+            let shown = Presentation { home: Some(home), up: Some([0.0, 0.0, 1.0]), target: Some([0.2, 0.1, 0.3]), ..Default::default() };
+            let start = Navigator::new(&shown, [-1.0; 3], [1.0; 3]);
+            let text = Navigator::pose_text(start.pose());
+            let read: Vec<f64> = text.split(',').map(|v| v.parse().unwrap()).collect();
+            let mut linked = start.clone();
+            linked.orbit(0.3, 0.2);
+            assert!(linked.set_pose(Navigator::pose_of(&read).unwrap()), "a field of view of {fov_x} is refused: {text}");
+            let (wanted, found) = (start.camera(640, 480), linked.camera(640, 480));
+            let [x, y, z] = [0, 1, 2].map(|row| DVec4::from(found.world_to_camera[row]).dot(start.target.extend(1.0)));
+            let off_px = (found.fx * x / z).hypot(found.fy * y / z);
+            assert!(off_px < 0.2 && (found.fx / wanted.fx - 1.0).abs() < 1e-5, "{text}: {off_px} pixels off, focal length {} of {}", found.fx, wanted.fx);
+        }
     }
 
     #[test]

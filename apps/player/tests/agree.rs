@@ -174,17 +174,53 @@ fn footprints_along_the_axes_of_the_image_are_drawn_whole() {
     }
 }
 
-#[test]
-fn a_model_that_the_device_refuses_leaves_the_one_before() {
-    if renderer().is_none() {
-        return;
-    }
+/// A renderer as [`renderer`] makes one, on a device with buffers of 131,072 bytes at most.
+fn small_renderer() -> Option<Renderer> {
+    renderer()?;
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
     let adapter = pollster::block_on(instance.request_adapter(&Default::default())).unwrap();
     let required_limits = wgpu::Limits { max_storage_buffer_binding_size: 1 << 17, ..Default::default() };
     let small = wgpu::DeviceDescriptor { required_limits, ..Default::default() };
     let (device, queue) = pollster::block_on(adapter.request_device(&small)).unwrap();
-    let mut renderer = Renderer::new(device, queue, wgpu::TextureFormat::Rgba8Unorm);
+    Some(Renderer::new(device, queue, wgpu::TextureFormat::Rgba8Unorm))
+}
+
+#[test]
+fn harmonics_that_no_buffer_holds_are_drawn_up_to_the_degree_that_fits() {
+    let (Some(mut small), Some(mut large)) = (small_renderer(), renderer()) else { return };
+    // At degree 3 the harmonics take 184,000 bytes, at degree 2 they take 96,000.
+    let n = 2000;
+    let gaussians = cc4dgs::HostGaussians {
+        sh_degree: 3,
+        means: [0.0, 0.1, 0.2].repeat(n),
+        log_scales: vec![-2.0; 3 * n],
+        quaternions: [1.0, 0.0, 0.0, 0.0].repeat(n),
+        opacity_logits: vec![3.0; n],
+        sh_dc: vec![0.5; 3 * n],
+        sh_rest: (0..45).map(|k| 0.02 * k as f32).collect::<Vec<f32>>().repeat(n),
+        dynamic_scores: vec![0.0; n],
+        ..Default::default()
+    };
+    let bytes = cc4dgs::core::ply::to_bytes(&gaussians, true).unwrap();
+    let content = || Content::read("n.ply", bytes.clone(), &Limits::default()).unwrap();
+    assert!(small.load(content().scene).is_err(), "the buffers are not small enough to say anything");
+    let mut fitted = content();
+    fitted.fit_harmonics(small.most_words(), "a buffer", "Use another device");
+    assert!(fitted.remarks.len() == 1 && fitted.remarks[0].contains("degree 2 of 3"), "{:?}", fitted.remarks);
+    small.load(fitted.scene).unwrap();
+    large.load(content().scene).unwrap();
+    let view = View::new(Camera::look_at("t", (64, 48), 0.8, [3.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]), 0.0);
+    let found = small.image(&view).unwrap().data;
+    assert_eq!(found, large.image(&View { sh_degree: 2, ..view.clone() }).unwrap().data);
+    assert_ne!(found, large.image(&view).unwrap().data, "degree 3 changes nothing");
+    // Those of all degrees, which arrive later, are cut down to the same.
+    small.load_harmonics(&gaussians).unwrap();
+    assert_eq!(found, small.image(&view).unwrap().data);
+}
+
+#[test]
+fn a_model_that_the_device_refuses_leaves_the_one_before() {
+    let Some(mut renderer) = small_renderer() else { return };
     let scene = |n: usize| {
         let gaussians = cc4dgs::HostGaussians {
             means: [0.0, 0.1, 0.2].repeat(n),

@@ -11,6 +11,8 @@ TOLD = """async source => { const { createPlayer } = await import("./player.js")
 # Textures of `side` texels, and no more.
 TEXTURES = """side => { const own = WebGL2RenderingContext.prototype, { getParameter } = own;
     own.getParameter = function (name) { return name === this.MAX_TEXTURE_SIZE ? side : getParameter.call(this, name); }; }"""
+# Buffers of `bytes`, and no more.
+BUFFERS = "bytes => { Object.defineProperty(GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', { get: () => bytes }); }"
 # Shows Gaussians and motion of `source` while the harmonics arrive, sets time, pose and playback, and then breaks the connection, or opens what is no model. The rest
 # arrives with the second connection. Returns what is left of what was set.
 HALF = """async ([source, breaks]) => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
@@ -137,7 +139,7 @@ def no_room(pages):
 
 
 def few_degrees(pages):
-    """Where only the harmonics do not fit into textures of WebGL2, their lower degrees are shown, and a warning says so once."""
+    """Where only the harmonics do not fit into textures of WebGL2 or buffers of WebGPU, their lower degrees are shown, and a warning says so once."""
     page = pages.open(f"?src={MODEL}&backend=webgl")
     facts = page.evaluate("cc4dgs.facts")
     stored, count = facts["shDegree"], facts["gaussians"]
@@ -154,8 +156,20 @@ def few_degrees(pages):
         return [facts.shDegree, facts.storedDegree, warned]; }""", [words - 1, "/slow-plain.cc4d"])
     assert shown[:2] == [stored - 1, stored] and len(shown[2]) == 1 and f"up to degree {stored - 1} of {stored}" in shown[2][0], shown
     page.close()
+    for source in ("/slow-plain.cc4d", "/gzip.cc4d"):
+        page = pages.open(before=f"({BUFFERS})({4 * (words - 1)})")
+        assert not page.evaluate("!!cc4dgs.gl"), "small buffers lead to WebGL2"
+        limited = page.evaluate("""async source => { const warned = []; cc4dgs.on("warning", e => warned.push(e.message));
+            const facts = await cc4dgs.load(source);
+            const { data } = await cc4dgs.capture();
+            return [facts.shDegree, facts.storedDegree, warned, data.some(v => v > 60 && v < 255), document.querySelector(".note").innerText]; }""", source)
+        assert limited[:2] == [stored - 1, stored] and len(limited[2]) == 1 and "buffer" in limited[2][0] and limited[3], limited
+        assert limited[2][0] in limited[4], f"the page does not say what it leaves out: {limited[4]!r}"
+        page.close()
+    # Chromium complains where a page leaves a compressed answer before its end.
+    pages.complaints[:] = [c for c in pages.complaints if "net::ERR_" not in c]
     pages.quiet("harmonics that do not fit")
-    say(f"harmonics that do not fit: {shown[2][0]}")
+    say(f"harmonics that do not fit: {shown[2][0]} {limited[2][0]}")
 
 
 def opened_meanwhile(pages):

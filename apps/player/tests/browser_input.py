@@ -1,4 +1,4 @@
-"""Checks of browser.py: files that are dropped, fingers on a screen, wheels, and reduced motion."""
+"""Checks of browser.py: files that are dropped, fingers on a screen, wheels, keys, reduced motion, and pages that are loaded again."""
 import math
 from browser_pages import MODEL, PATIENCE_MS, say
 
@@ -20,7 +20,17 @@ def drop(page, facts):
     assert opened["gaussians"] == facts["gaussians"] and opened["frames"] == facts["frames"], opened
     assert page.evaluate("cc4dgs.source.name") == "dropped.cc4d" and page.title().startswith("dropped.cc4d")
     assert "src=" not in page.evaluate("cc4dgs.link()"), "the link of a file without an address names another one"
-    say("a file that is dropped on the page is opened")
+    text = page.evaluate_handle("() => { const text = new DataTransfer(); text.setData('text/plain', 'no file'); return text; }")
+    page.dispatch_event(".cc canvas", "drop", {"dataTransfer": text})
+    assert "Only files" in page.locator(".note").inner_text(), "nothing is said of what is no file"
+    page.locator(".cc canvas").focus()
+    page.keyboard.press("Escape")
+    assert page.locator(".note").is_hidden(), "Escape does not close what is said"
+    share = page.evaluate("""async () => { const share = [...document.querySelectorAll(".panel button")].find(b => b.textContent === "Copy link");
+        await share.onclick(); return document.querySelector(".note").innerText; }""")
+    assert "not the file" in share, f"nothing says that a link lacks the file that was dropped: {share!r}"
+    page.keyboard.press("Escape")
+    say("a file that is dropped on the page is opened; what is no file is refused with a message")
 
 
 def wheel(page):
@@ -67,6 +77,61 @@ def held(page):
         page.evaluate(key, [".", repeat])
     assert page.evaluate("cc4dgs.gpu.frame === Math.min(2, cc4dgs.facts.frames - 1)"), "a full stop that is held down does not step on"
     say("a key that is held down switches once, or steps on")
+
+
+def cameras(page):
+    """The list of cameras says where the view is from, so that the same camera can be chosen again."""
+    chosen = "document.querySelector('.panel select').selectedOptions[0].textContent"
+    page.keyboard.press("r")
+    home = page.evaluate(POSE)
+    assert page.evaluate(chosen) == "Home", page.evaluate(chosen)
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate(chosen) == "Free view", page.evaluate(chosen)
+    turned = page.evaluate(POSE)
+    assert length([a - b for a, b in zip(arm(home), arm(turned))]) > 1e-3 * length(arm(home)), "an arrow key does not orbit"
+    page.evaluate("cc4dgs.goTo(-1)")
+    assert page.evaluate(chosen) == "Home" and page.evaluate(POSE) == home
+    # Flying, arrow keys turn the view where the eye is.
+    page.keyboard.press("f"), page.keyboard.press("ArrowLeft")
+    looked = page.evaluate(POSE)
+    page.keyboard.press("f"), page.keyboard.press("r")
+    eye, target = (length([a - b for a, b in zip(home[k:k + 3], looked[k:k + 3])]) for k in (0, 3))
+    assert eye < 1e-6 * length(arm(home)) < 1e-3 * target, f"an arrow key moves the eye by {eye} and its target by {target} while flying"
+    say("the list of cameras follows the view; arrow keys orbit, and look around while flying")
+
+
+def key_list(page):
+    """The question mark lists the keys, and Escape closes the list."""
+    page.keyboard.press("?")
+    opened = "document.querySelector('.panel details').open"
+    assert page.evaluate(opened) and "W A S D" in page.locator(".panel details").inner_text(), "there is no list of keys"
+    assert page.evaluate("document.activeElement.tagName") == "SUMMARY"
+    plays = page.evaluate("cc4dgs.playing")
+    page.keyboard.press(" ")
+    assert not page.evaluate(opened) and page.evaluate("cc4dgs.playing") == plays, "Space does not close the list alone"
+    page.keyboard.press("Escape")
+    assert page.locator(".panel").is_hidden() and page.evaluate("document.activeElement.ariaExpanded") == "false"
+    page.locator(".cc canvas").focus()
+    say("the question mark lists the keys")
+
+
+def reloaded(pages):
+    """A page that is loaded again has settings, time and pose of before, and plays no more than it did."""
+    page = pages.open(f"?src={MODEL}&autoplay")
+    page.evaluate("cc4dgs.pause(); cc4dgs.seek(0.375); cc4dgs.gpu.orbit(0.3, 0.1); cc4dgs.set('tint', true); cc4dgs.set('speed', 0.25)")
+    pose = page.evaluate(POSE)
+    page.reload()
+    page.wait_for_function("window.cc4dgs?.facts")
+    time, playing, tint, speed = page.evaluate("[cc4dgs.time, cc4dgs.playing, cc4dgs.settings.tint, document.querySelector('.bar select').value]")
+    far = max(abs(a - b) for a, b in zip(pose, page.evaluate(POSE)))
+    assert far < 1e-9 and abs(time - 0.375) < 1e-6 and not playing and tint and speed == "0.25", [far, time, playing, tint, speed]
+    address = page.url
+    page.goto("about:blank"), page.goto(address)
+    page.wait_for_function("window.cc4dgs?.facts")
+    assert not page.evaluate("cc4dgs.settings.tint"), "a page that is opened anew has the state of one before"
+    page.close()
+    pages.quiet("a page that is loaded again")
+    say("a page that is loaded again goes on as it was")
 
 
 def focus(pages):

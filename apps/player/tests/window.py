@@ -106,9 +106,9 @@ def computing(screen):
     return bool((numpy.abs(sign - COMPUTING).max(axis=2) < 40).sum() > 20), sign
 
 
-def message(screen):
-    """Whether a message takes the top of the window, in all of its width; the sign of exact images takes less."""
-    return (numpy.asarray(screen.image().crop((0, 0, SIZE[0], 24))) == GROUND).all(axis=2).mean() > 0.6
+def message(screen, rows=(0, 24)):
+    """Whether a message takes these rows of the window, in all of its width; the sign of exact images takes less."""
+    return (numpy.asarray(screen.image().crop((0, rows[0], SIZE[0], rows[1]))) == GROUND).all(axis=2).mean() > 0.6
 
 
 def exact(screen):
@@ -331,6 +331,13 @@ def main():
         screen.drag((140, bar), (520, bar))
         screen.wait(lambda scene: different(start, scene) > 0.02, "the slider does not move the trained model")
         shot("train_scrubbed")
+        second = (26, 42)
+        assert not message(screen, second), "there is a line below that of the training before a file was dropped"
+        assert drop(screen.display, window, archive), "the window does not take a file"
+        screen.wait(lambda scene: message(screen, second), "nothing is said of a file that is dropped on a training")
+        assert "watched" in screen.tool("getwindowname", window), "a file took the place of the training"
+        shot("train_dropped")
+        say("a file that is dropped on a training is refused with a message")
         close(screen.display, window)
         assert training.wait(60) == 0, f"the watched training ends with {training.returncode}"
         assert checkpoint.read_bytes() == plain.read_bytes(), "the watched training ended in other bytes"

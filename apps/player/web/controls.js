@@ -1,4 +1,4 @@
-// The controls as HTML elements.
+// The controls as HTML elements, and what a user takes along: images, links, and what a reload keeps.
 
 function element(tag, properties = {}, ...children) {
     const { attributes = {}, ...own } = properties;
@@ -11,6 +11,14 @@ function element(tag, properties = {}, ...children) {
 const labelled = label => ({ attributes: { "aria-label": label }, title: label });
 const megabytes = bytes => (bytes >= 1e6 ? `${(bytes / 1e6).toFixed(2)} MB` : `${(bytes / 1e3).toFixed(1)} kB`);
 
+// What gestures and keys do.
+const HELP = [
+    ["Drag, one finger, arrow keys", "orbit, or look around when flying"], ["Wheel, pinch, + and −", "zoom"], ["Shift-drag, right button, two fingers", "pan"],
+    ["W A S D Q E", "fly"], ["F", "switch between orbiting and flying"], ["R", "first view"],
+    ["Space", "play and pause"], ["Comma, full stop", "a frame back, a frame on"], ["Home, End", "first and last frame"],
+    ["T, Z", "tint what moves, show depth"], ["P", "save a PNG"], ["Escape", "close this"], ["?", "this list"],
+];
+
 /// Saves an image of RGBA pixels as the file `download`.
 export async function savePng({ width, height, data }, download) {
     const canvas = element("canvas", { width, height });
@@ -22,10 +30,65 @@ export async function savePng({ width, height, data }, download) {
     setTimeout(() => URL.revokeObjectURL(href), 60000);
 }
 
+/// An address with source, time and pose of `player`.
+export function linkOf(player) {
+    const url = new URL(location.href), { gpu, source, time } = player;
+    // A file that was dropped has no address.
+    if (typeof source === "string") url.searchParams.set("src", source); else if (source) url.searchParams.delete("src");
+    if (gpu) url.hash = `t=${Number(time.toPrecision(6))}&pose=${gpu.poseText}`;
+    return url.href;
+}
+
+/// Takes time and pose of the page's address.
+export function followLink(player) {
+    const hash = new URLSearchParams(location.hash.slice(1));
+    const pose = hash.get("pose")?.split(",").map(Number);
+    // Another number of values than a pose has is ignored.
+    if (pose) player.setPose(pose);
+    if (hash.has("t")) player.seek(Number(hash.get("t")));
+    player.dirty = true;
+}
+
+// Where the state of this page is kept: under its address without time and pose, and the model that it opens.
+const kept = ({ own }) => `cc4dgs ${location.pathname}${location.search} ${typeof own === "string" ? own : ""}`;
+
+/// Has the page that `player` is alone follow links, and go on as it was after a reload. Until `signal` aborts.
+export function remember(player, signal) {
+    const keep = () => {
+        const { settings, flying, gpu, drawnFacts, source, own } = player;
+        // The model that was opened last is not the one that a reload opens, unless it is that of the page.
+        const view = gpu && drawnFacts && source === own ? { ...player.now, pose: Array.from(gpu.pose) } : null;
+        // Some pages have no storage.
+        try { sessionStorage.setItem(kept(player), JSON.stringify({ settings, flying, view })); } catch (e) { console.debug(e); }
+    };
+    window.addEventListener("pagehide", keep, { signal });
+    // Phones end pages that nobody sees without another word.
+    document.addEventListener("visibilitychange", () => { if (document.hidden) keep(); }, { signal });
+    // Where the page is open already, a link to it changes the hash alone. "Copy link" replaces the address, of which nobody is told.
+    window.addEventListener("hashchange", () => followLink(player), { signal });
+}
+
+/// Gives `player` the settings that it had before its page was loaded again, once; returns how its model stood then, null where that is not known.
+export function restore(player) {
+    const again = ["reload", "back_forward"].includes(performance.getEntriesByType("navigation")[0]?.type);
+    if (!again || player.ui.embedded) return null;
+    try {
+        const { settings, flying, view } = JSON.parse(sessionStorage.getItem(kept(player))) ?? {};
+        sessionStorage.removeItem(kept(player));
+        for (const name of Object.keys(player.settings)) player.settings[name] = settings?.[name] ?? player.settings[name];
+        player.set("flying", !!flying);
+        return view ?? null;
+    } catch (e) {
+        console.debug(e);
+        return null;
+    }
+}
+
 export function build(container, player) {
     const button = (text, label, onclick) => element("button", { type: "button", textContent: text, onclick, ...labelled(label) });
-    const canvas = element("canvas", { tabIndex: 0, ...labelled("3D view. Drag to orbit, wheel or pinch to zoom, shift-drag or two fingers to pan.") });
-    canvas.removeAttribute("title");
+    // An application gets the keys from screen readers.
+    const about = "3D view. Drag or arrow keys orbit, wheel, pinch, plus and minus zoom, shift-drag or two fingers pan. The question mark lists all keys.";
+    const canvas = element("canvas", { tabIndex: 0, attributes: { role: "application", "aria-label": about } });
     const poster = element("img", { className: "poster", alt: "", hidden: true });
     const title = element("div", { className: "title" });
     const file = element("input", { type: "file", accept: ".cc4d,.ply,.spz", ...labelled("Open a file"), onchange: () => { if (file.files[0]) open(file.files[0]); file.value = ""; } });
@@ -42,10 +105,12 @@ export function build(container, player) {
     // Screen readers would read it out with every frame.
     const clock = element("output", { textContent: "–", attributes: { "aria-live": "off" } });
     const speeds = [0.1, 0.25, 0.5, 1, 2, 4];
-    const speed = element("select", { className: "wide", ...labelled("Speed"), onchange: () => player.set("speed", Number(speed.value)) },
-        ...speeds.map(v => element("option", { value: v, textContent: `${v}×`, selected: v === 1 })));
+    // Phones have no room for it in the bar.
+    const [speed, narrowSpeed] = ["wide", ""].map(className => element("select", { className, ...labelled("Speed"), onchange: e => player.set("speed", Number(e.target.value)) },
+        ...speeds.map(v => element("option", { value: v, textContent: `${v}×` }))));
     const loop = button("⟳", "Loop", () => player.set("looping", !player.settings.looping));
-    const gear = button("☰", "Settings", () => { panel.hidden = !panel.hidden; gear.setAttribute("aria-expanded", String(!panel.hidden)); });
+    const showPanel = on => { panel.hidden = !on; gear.setAttribute("aria-expanded", String(on)); };
+    const gear = button("☰", "Settings and help", () => showPanel(panel.hidden));
     gear.setAttribute("aria-expanded", "false");
     const bar = element("div", { className: "bar", attributes: { role: "group", "aria-label": "Playback" } },
         play, button("‹", "One frame back", () => player.step(-1)), button("›", "One frame on", () => player.step(1)), time, clock, speed, loop);
@@ -67,21 +132,34 @@ export function build(container, player) {
         depth: check("Depth", "depth"),
     };
     const camera = element("select", { ...labelled("Camera"), onchange: () => { player.goTo(Number(camera.value)); } });
+    // Selected again, an entry tells nobody: a view that is of no camera has one of its own, which cannot be chosen.
+    const cameras = names => {
+        const at = camera.value, entry = (value, textContent) => element("option", { value, textContent });
+        camera.replaceChildren(Object.assign(entry("", "Free view"), { hidden: true, disabled: true }), entry(-1, "Home"), ...names.map((name, i) => entry(i, name)));
+        ui.camera(at);
+    };
     const fly = button("Fly", "Fly with W A S D Q E, drag to look", () => player.set("flying", !player.flying));
-    const share = button("Copy link", "Copy a link with time and pose", async () => {
+    const share = button("Copy link", "Copy link with time and pose", async () => {
         const link = player.link();
         let failed = "In address bar";
         // A frame of `srcdoc` has no address to change.
         try { history.replaceState(null, "", link); } catch { failed = "Not copied"; }
         try { await navigator.clipboard.writeText(link); share.textContent = "Copied"; } catch { share.textContent = failed; }
         setTimeout(() => { share.textContent = "Copy link"; }, 1500);
+        if (player.source instanceof Blob) ui.note("The link has time and pose, but not the file: who follows it has to open the file, too.");
     });
+    // What it says after a click is its name then.
+    share.removeAttribute("aria-label");
+    const topic = element("summary", { textContent: "Keys and gestures" });
+    const help = element("details", {}, topic, element("dl", {}, ...HELP.flatMap(([keys, does]) => [element("dt", { textContent: keys }), element("dd", { textContent: does })])));
     const stats = element("p", { className: "stats" });
     const panel = element("section", { className: "panel", hidden: true, ...labelled("Settings") },
         element("label", {}, "Camera", camera),
-        element("div", { className: "row" }, button("Reset", "Back to the first view", () => { camera.value = -1; player.reset(); }), fly),
+        element("div", { className: "row" }, button("Reset", "Reset to the first view", () => player.reset()), fly),
+        element("label", { className: "narrow" }, "Speed", narrowSpeed),
         ...Object.values(controls).map(c => c.row),
         element("div", { className: "row" }, button("PNG", "Save the image as PNG", () => player.savePng()), share),
+        help,
         stats);
     panel.removeAttribute("title");
     const note = element("div", { className: "note", attributes: { role: "status" } });
@@ -95,18 +173,27 @@ export function build(container, player) {
     document.documentElement.classList.toggle("cc-embedded", !document.querySelector("body > main > .cc"));
 
     const open = source => player.load(source).catch(() => {});
+    const close = () => {
+        if (note.hidden) return;
+        note.hidden = true;
+        ui.canvas.focus({ preventScroll: true });
+    };
     const say = (text, error) => {
         note.hidden = !text;
         note.className = error ? "note error" : player.facts ? "note hint" : "note";
         note.setAttribute("role", error ? "alert" : "status");
-        note.replaceChildren(element("p", { textContent: text ?? "" }), ...(text && player.facts ? [button("Close", "Close", () => { note.hidden = true; ui.canvas.focus({ preventScroll: true }); })] : []));
+        note.replaceChildren(element("p", { textContent: text ?? "" }), ...(text && player.facts ? [button("Close", "Close", close)] : []));
     };
     let depth = 0;
     const drag = (name, run) => root.addEventListener(name, e => { e.preventDefault(); run(e); root.classList.toggle("dropping", depth > 0); });
     drag("dragenter", () => depth++);
     drag("dragleave", () => depth--);
     drag("dragover", () => {});
-    drag("drop", e => { depth = 0; if (e.dataTransfer.files[0]) open(e.dataTransfer.files[0]); });
+    drag("drop", e => {
+        depth = 0;
+        const [dropped] = e.dataTransfer.files;
+        if (dropped) open(dropped); else ui.note("Only files can be dropped here. Save it first, as a .cc4d, .ply or .spz file.");
+    });
 
     const ui = {
         root, canvas, embedded,
@@ -127,7 +214,7 @@ export function build(container, player) {
             const still = facts.frames < 2;
             bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = still; });
             time.step = still ? 1 : 0.0005;
-            camera.replaceChildren(element("option", { value: -1, textContent: "Home" }), ...facts.cameras.map((name, i) => element("option", { value: i, textContent: name })));
+            cameras(facts.cameras);
             // All degrees of one model mean all degrees of the next.
             const { input } = controls.shDegree, all = player.settings.shDegree >= Number(input.max);
             input.max = facts.shDegree;
@@ -138,7 +225,7 @@ export function build(container, player) {
         /// There is nothing to play or to look at.
         empty: () => {
             bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = true; });
-            camera.replaceChildren();
+            cameras([]);
             clock.textContent = "–";
             stats.textContent = "";
             ui.playing(false);
@@ -154,22 +241,35 @@ export function build(container, player) {
             Object.entries(controls).forEach(([name, control]) => control.show(values[name]));
             loop.setAttribute("aria-pressed", String(values.looping));
             fly.setAttribute("aria-pressed", String(values.flying));
-            speed.value = values.speed;
+            [speed, narrowSpeed].forEach(select => { select.value = values.speed; });
+        },
+        /// Shows that the view is of the camera `index`: -1 is home, "" none.
+        camera: index => {
+            camera.value = index;
+            if (camera.selectedIndex < 0) camera.value = "";
         },
         wantsStatistics: () => !panel.hidden,
         statistics: s => {
             stats.textContent = `${s.rate.toFixed(0)} frames/s, ${s.visible.toLocaleString("en")} of ${s.gaussians.toLocaleString("en")} Gaussians drawn\n` +
                 `${s.moving.toLocaleString("en")} move, ${megabytes(s.received ?? s.bytes)} fetched of ${megabytes(s.bytes)}, ${megabytes(s.gpuBytes)} on the GPU\n${s.adapter ?? ""}`;
         },
-        closePanel: () => {
+        /// Closes the settings, else what is said over the model.
+        dismiss: () => {
             // What is hidden loses the focus, and keys would reach the player no more.
             if (panel.contains(document.activeElement)) gear.focus();
-            panel.hidden = true;
-            gear.setAttribute("aria-expanded", "false");
+            if (panel.hidden && player.facts) close();
+            showPanel(false);
+        },
+        /// Shows the list of keys.
+        help: () => {
+            showPanel(true);
+            help.open = true;
+            topic.focus();
         },
     };
     ui.settings({ ...player.settings, flying: false });
     ui.empty();
+    ui.camera(-1);
     say("Open a .cc4d, .ply or .spz file, or drop one here.");
     return ui;
 }

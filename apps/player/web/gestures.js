@@ -60,19 +60,21 @@ export function addGestures(canvas, act, signal) {
 }
 
 // Keys that switch something or save a file: held down, they do it once.
-const ONCE = new Set([" ", "k", "f", "t", "z", "p"]);
+const ONCE = new Set([" ", "k", "f", "t", "z", "p", "?"]);
 // Keys that move a slider.
 const SLIDE = /^(Arrow(Left|Right|Up|Down)|Home|End|PageUp|PageDown)$/;
 const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 
 /// What `player` does at a key; `act` moves its camera.
 export function commandsOf(player, act) {
+    const turn = (right, upwards) => (act.mode() === "fly" ? act.look : act.orbit)(right, upwards);
     return {
         " ": () => player.toggle(), "k": () => player.toggle(), ",": () => player.step(-1), ".": () => player.step(1),
-        ArrowLeft: () => act.orbit(-0.08, 0), ArrowRight: () => act.orbit(0.08, 0), ArrowUp: () => act.orbit(0, 0.08), ArrowDown: () => act.orbit(0, -0.08),
+        ArrowLeft: () => turn(-0.08, 0), ArrowRight: () => turn(0.08, 0), ArrowUp: () => turn(0, 0.08), ArrowDown: () => turn(0, -0.08),
         "+": () => act.zoom(1.1), "=": () => act.zoom(1.1), "-": () => act.zoom(1 / 1.1), Home: () => player.seek(0), End: () => player.seek(1),
         "r": () => player.reset(), "f": () => player.set("flying", !player.flying), "t": () => player.set("tint", !player.settings.tint),
-        "z": () => player.set("depth", !player.settings.depth), "p": () => player.savePng(), "Escape": () => player.ui.closePanel(),
+        "z": () => player.set("depth", !player.settings.depth), "p": () => player.savePng(), "Escape": () => player.ui.dismiss(),
+        "?": () => player.ui.help(),
     };
 }
 
@@ -89,7 +91,7 @@ export function addKeys(element, act, commands, signal) {
         const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
         if (FLY[key]) { held.add(key); e.preventDefault(); return; }
         // Sliders keep the keys that move them, buttons and boxes those that press them.
-        const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input") && (key === " " || key === "Enter");
+        const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input, summary") && (key === " " || key === "Enter");
         if (!commands[key] || own) return;
         if (!e.repeat || !ONCE.has(key)) commands[key]();
         e.preventDefault();

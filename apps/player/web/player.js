@@ -11,7 +11,7 @@ import init, * as wasm from "./cc4dgs_player.js";
 import { bytesOf, checkSize, loadUrl, nameOf } from "./loading.js";
 import { addGestures, addKeys, commandsOf } from "./gestures.js";
 import { WebGl } from "./webgl.js";
-import { build, savePng } from "./controls.js";
+import { build, followLink, linkOf, remember, restore, savePng } from "./controls.js";
 
 // What exports need of a page: raise it together with PAGE_VERSION in exporters/src/web/page.rs where archives need a newer one.
 export const PAGE_VERSION = 3;
@@ -28,6 +28,8 @@ export async function createPlayer(container, options = {}) {
     const query = new URLSearchParams(location.search);
     const { src = query.get("src") ?? undefined, autoplay = query.has("autoplay"), backend = query.get("backend") } = options;
     const player = new Page(container, backend);
+    player.own = src;
+    const view = restore(player);
     try {
         // Another player may have it where this one could not fetch it.
         ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined).catch(e => {
@@ -37,8 +39,11 @@ export async function createPlayer(container, options = {}) {
         await ready;
         await player.start();
         const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-        if (src) await player.load(src, options.name, { playing: autoplay && !still });
-        else player.followLink();
+        const first = { playing: autoplay, ...view };
+        if (src) await player.load(src, options.name, { ...first, playing: first.playing && !still });
+        else followLink(player);
+        // Where there is no model, the link is for the file that is opened first.
+        if (!src && location.hash) player.linked = {};
     } catch (e) {
         player.fail(e);
     }
@@ -55,6 +60,8 @@ class Page {
         this.dirty = true;
         this.settings = { speed: 1, looping: true, scale: 1, shDegree: 4, resolution: 1, tint: false, depth: false };
         this.flying = false;
+        // Index of the camera that the view is of: -1 is home, "" none.
+        this.camera = -1;
         // Aborted when the player is destroyed.
         this.life = new AbortController();
         this.ui = build(container, this);
@@ -69,7 +76,7 @@ class Page {
         this.apply();
         const act = {
             mode: () => (this.flying ? "fly" : "orbit"),
-            ...Object.fromEntries(["orbit", "look", "pan", "zoom", "fly"].map(name => [name, (...values) => { this.gpu?.[name](...values); this.dirty = true; }])),
+            ...Object.fromEntries(["orbit", "look", "pan", "zoom", "fly"].map(name => [name, (...values) => { this.gpu?.[name](...values); this.moved(); }])),
         };
         const { canvas, embedded, root } = this.ui, { signal } = this.life;
         if (this.attached !== canvas) {
@@ -83,8 +90,7 @@ class Page {
         if (!this.flyKeys) {
             // On a page of its own the player has the keys before anything was clicked.
             this.flyKeys = addKeys(embedded ? root : document, act, commandsOf(this, act), signal);
-            // Where the page is open already, a link to it changes the hash alone. "Copy link" replaces the address, of which nobody is told.
-            if (!embedded) window.addEventListener("hashchange", () => this.followLink(), { signal });
+            if (!embedded) remember(this, signal);
             this.request = requestAnimationFrame(now => this.loop(now));
         }
         this.resize();
@@ -138,6 +144,7 @@ class Page {
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
+        [first, this.linked] = [first ?? this.linked ?? null, null];
         const again = this.gpu && source === this.source && this.facts;
         // How things stood when the first of this model was opened. A model that is loaded again goes on from there.
         let before = null;
@@ -154,14 +161,14 @@ class Page {
                 // A download that begins anew goes on with pose and time.
                 const anew = starts && !before;
                 if (anew) begin();
-                this.loaded(JSON.parse(this.gpu.openPart(download, layer, motion, degree, anew)));
+                this.loaded(JSON.parse(this.gpu.openPart(download, layer, motion, degree, anew)), anew);
             },
             harmonics: (download, degree) => { this.gpu.openHarmonics(download, degree); this.gl?.loadHarmonics(this.gpu); this.draw(); },
             whole: (name, bytes) => {
                 // A later load has the page; reading bytes is not interrupted.
                 if (signal.aborted) throw signal.reason;
                 begin();
-                this.loaded(JSON.parse(this.gpu.open(name, bytes)));
+                this.loaded(JSON.parse(this.gpu.open(name, bytes)), true);
             },
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
@@ -215,16 +222,14 @@ class Page {
     get problem() { return this.failure ?? this.first?.back ?? null; }
     /// Says what is not shown of the model.
     warn() {
-        const { lacksMotion, shDegree, storedDegree, remarks } = this.facts, lines = [...remarks];
-        if (lacksMotion) lines.push("This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d");
-        if (shDegree < storedDegree) lines.push(`Spherical harmonics are shown up to degree ${shDegree} of ${storedDegree}: more do not fit into a texture of WebGL2. Use a browser with WebGPU to see all.`);
-        const message = lines.join(" ");
+        const message = this.facts.remarks.join(" ");
         if (message) { this.ui.note(message); this.emit("warning", { message }); }
     }
     /// Facts of the model that is drawn: while another one is fetched, those of the one before.
     get drawnFacts() { return this.facts ?? this.shown?.facts ?? null; }
     title() { return this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source?.name ?? "model"); }
-    loaded(facts) {
+    /// A model is shown, or more of it; `anew` from its start.
+    loaded(facts, anew) {
         this.facts = facts;
         if (this.shown) this.shown.ended = false;
         this.gl?.load(this.gpu, facts.moving);
@@ -232,11 +237,12 @@ class Page {
         this.ui.error(this.problem);
         this.ui.playing(this.gpu.playing);
         this.apply();
+        if (anew) this.moved(-1);
         const { first } = this;
         this.shown = { source: this.source, name: this.name, facts, first };
         if (first && !first.seen) {
             first.seen = true;
-            if (first.pose) { this.gpu.pose = first.pose; this.seek(first.time); } else this.followLink();
+            if (first.pose) { this.setPose(first.pose, first.camera); this.seek(first.time); } else followLink(this);
         }
         if (first?.playing && facts.frames > 1) { first.playing = false; this.play(); }
         this.draw();
@@ -246,7 +252,7 @@ class Page {
     get time() { return this.gpu?.time ?? 0; }
     get playing() { return this.gpu?.playing ?? false; }
     /// Where the model that is shown stands, and whether it plays as soon as it can.
-    get now() { return { pose: this.gpu.pose, time: this.time, playing: this.playing || !!this.shown?.first?.playing }; }
+    get now() { return { pose: this.gpu.pose, camera: this.camera, time: this.time, playing: this.playing || !!this.shown?.first?.playing }; }
     play() { this.setPlaying(true); }
     pause() { this.setPlaying(false); }
     toggle() { this.setPlaying(!this.playing); }
@@ -266,8 +272,14 @@ class Page {
         this.emit("time", detail);
     }
     // View
-    reset() { this.gpu?.reset(); this.dirty = true; }
-    goTo(index) { if (index < 0) this.reset(); else this.gpu?.goTo(index); this.dirty = true; }
+    reset() { this.gpu?.reset(); this.moved(-1); }
+    goTo(index) { if (index < 0) return this.reset(); this.gpu?.goTo(index); this.moved(index); }
+    setPose(pose, camera) { if (this.gpu) this.gpu.pose = new Float64Array(pose); this.moved(camera); }
+    /// The view is another one: that of a camera, or of none.
+    moved(camera = "") {
+        if (camera !== this.camera) this.ui.camera(this.camera = camera);
+        this.dirty = true;
+    }
     set(name, value) {
         if (name === "flying") this.flying = value; else this.settings[name] = value;
         this.ui.settings({ ...this.settings, flying: this.flying });
@@ -387,19 +399,5 @@ class Page {
         const name = `frame_${String(this.gpu.frame).padStart(4, "0")}.png`;
         try { await savePng(await this.capture(), name); } catch (e) { this.fail(e); }
     }
-    link() {
-        const url = new URL(location.href);
-        // A file that was dropped has no address.
-        if (typeof this.source === "string") url.searchParams.set("src", this.source); else if (this.source) url.searchParams.delete("src");
-        if (this.gpu) url.hash = `t=${Number(this.time.toPrecision(6))}&pose=${this.gpu.poseText}`;
-        return url.href;
-    }
-    followLink() {
-        const hash = new URLSearchParams(location.hash.slice(1));
-        const pose = hash.get("pose")?.split(",").map(Number);
-        // Another number of values than a pose has is ignored.
-        if (pose && this.gpu) this.gpu.pose = new Float64Array(pose);
-        if (hash.has("t")) this.seek(Number(hash.get("t")));
-        this.dirty = true;
-    }
+    link() { return linkOf(this); }
 }

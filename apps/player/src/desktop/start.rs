@@ -1,6 +1,7 @@
 //! The time and the pose that a window begins at, as the options of a command.
 
 use crate::Navigator;
+use crate::navigator::POSE_FOV;
 use cc4dgs_format::{Error, Result};
 use std::path::Path;
 
@@ -24,7 +25,8 @@ impl Start {
         let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse().map_err(|_| wrong(format!("{v:?} is no number")))).collect::<Result<_>>()?;
         let pose = Navigator::pose_of(&numbers).ok_or_else(|| wrong(format!("it has {} numbers, not 7 or 8", numbers.len())))?;
         let sees = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]).set_pose(pose);
-        if sees { Ok(pose) } else { Err(wrong("a number is not finite, eye and target are one point, or the angle is not between 0.01 and 3.1".into())) }
+        let angles = || format!("{:e} to {}", POSE_FOV.start(), POSE_FOV.end());
+        if sees { Ok(pose) } else { Err(wrong(format!("a number is not finite, eye and target are one point, or the angle is not from {}", angles()))) }
     }
     /// Reads a normalised time.
     ///
@@ -45,6 +47,11 @@ impl Start {
         }
         out
     }
+}
+
+/// Why a window that shows a training does not open `file`, and what does.
+pub(crate) fn busy_with_training(file: &Path) -> String {
+    format!("This window shows a training, and opens no file. Another window does: {}", Start::default().command("cc4dgs view", file))
 }
 
 fn quoted(text: &str) -> String {
@@ -69,10 +76,16 @@ mod tests {
     }
 
     #[test]
+    fn a_window_of_a_training_names_the_command_that_opens_a_file() {
+        let said = busy_with_training(Path::new("my runs/a.cc4d"));
+        assert!(said.contains("shows a training") && said.ends_with("cc4dgs view 'my runs/a.cc4d'"), "{said}");
+    }
+
+    #[test]
     fn poses_and_times_that_mean_nothing_are_refused() {
-        for (text, said) in
-            [("1,2,3", "3 numbers"), ("a,0,0,0,0,0,1", "\"a\""), ("1,1,1,1,1,1,0.9", "one point"), ("0,0,0,1,0,0,9", "angle"), ("NaN,0,0,1,0,0,1", "one point")]
-        {
+        let (point, angle) = ("one point", "from 1e-9 to 3.1");
+        let wrong = [("1,2,3", "3 numbers"), ("a,0,0,0,0,0,1", "\"a\""), ("1,1,1,1,1,1,0.9", point), ("0,0,0,1,0,0,9", angle), ("NaN,0,0,1,0,0,1", point)];
+        for (text, said) in wrong {
             let message = Start::parse_pose(text).unwrap_err().to_string();
             assert!(message.contains(said), "{text}: {message}");
         }

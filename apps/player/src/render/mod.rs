@@ -80,6 +80,10 @@ impl Renderer {
     pub fn queue(&self) -> &wgpu::Queue {
         &self.queue
     }
+    /// 32-bit numbers that one buffer of the device holds: what [`Content::fit_harmonics`](crate::Content::fit_harmonics) asks for.
+    pub fn most_words(&self) -> u64 {
+        uploaded::most_bytes(&self.device) / 4
+    }
     /// Uploads `scene` in place of the one before, whose buffers are freed first. Where it is refused, the one before stays.
     ///
     /// # Errors

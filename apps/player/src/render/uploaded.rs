@@ -38,11 +38,16 @@ fn group(device: &wgpu::Device, layout: &wgpu::BindGroupLayout, buffers: &[&wgpu
     device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout, entries: &entries })
 }
 
+/// Bytes of the largest buffer that shaders of `device` read.
+pub(super) fn most_bytes(device: &wgpu::Device) -> u64 {
+    device.limits().max_storage_buffer_binding_size.min(device.limits().max_buffer_size)
+}
+
 impl Uploaded {
     /// Refuses scenes that `device` has no buffers for.
     pub(super) fn check(device: &wgpu::Device, scene: &Scene) -> Result<()> {
         let n = scene.count as u64;
-        let most = device.limits().max_storage_buffer_binding_size.min(device.limits().max_buffer_size);
+        let most = most_bytes(device);
         let words = [scene.gaussians.len(), scene.harmonics.len(), scene.starts.len(), scene.coefficients.len()];
         let largest = words.map(|w| 4 * w as u64).into_iter().chain([SPLAT_BYTES * n]);
         if let Some(bytes) = largest.max().filter(|b| *b > most) {

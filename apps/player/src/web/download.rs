@@ -110,7 +110,8 @@ impl Download {
         let bytes = self.opened()?.total_bytes()?;
         if !motion {
             self.model = Some((model.clone(), stage));
-            return Ok(Content { lacks_motion: false, ..Content::of_model(model, bytes)? });
+            // Whether it has any is not known yet.
+            return Ok(Content { lacks_motion: false, remarks: Vec::new(), ..Content::of_model(model, bytes)? });
         }
         let playback = PlaybackLayer::of_archive(&name, self.opened()?, &model.gaussians, model.moving, limits)?;
         Content::of_model(StoredModel { playback, ..model }, bytes)

@@ -2,11 +2,10 @@
 
 mod capture;
 mod download;
+mod plain;
 
-use crate::render::{Frame, functions};
 use crate::{Clock, Content, Mode, Navigator, Renderer, Scene, View, request_device};
 use capture::Capture;
-use cc4dgs_format::playback::Head;
 use cc4dgs_format::{Camera, Error, Limits, StreamStage};
 use download::Download;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -126,9 +125,13 @@ impl Player {
         }
         Ok(())
     }
-    fn show(&mut self, content: Content, first: bool) -> Result<String, JsError> {
-        let Content { mut scene, presentation, frame_count, lacks_motion, remarks, bytes } = content;
-        scene.fit_harmonics(if let Output::Plain { most_words, .. } = &self.output { *most_words } else { u64::MAX });
+    fn show(&mut self, mut content: Content, first: bool) -> Result<String, JsError> {
+        let (most_words, room, remedy) = match &self.output {
+            Output::WebGpu { renderer, .. } => (renderer.most_words(), "a buffer of WebGPU here", "`cc4dgs view` may show all"),
+            Output::Plain { most_words, .. } => (*most_words, "a texture of WebGL2", "Use a browser with WebGPU to see all"),
+        };
+        content.fit_harmonics(most_words, room, remedy);
+        let Content { scene, presentation, frame_count, lacks_motion, remarks, bytes } = content;
         let (count, moving, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.gpu_bytes(), scene.bounds);
         let degrees = [scene.drawn_degree, scene.sh_degree];
         match &mut self.output {
@@ -202,43 +205,6 @@ impl Player {
             renderer.draw(&view, &frame.texture.create_view(&Default::default()));
             renderer.queue().present(frame);
         }
-    }
-    fn plain_scene(&self) -> Option<&Scene> {
-        if let Output::Plain { scene, .. } = &self.output { scene.as_ref() } else { None }
-    }
-    /// For WebGL2: the Gaussians (0) or the coefficients (1).
-    #[wasm_bindgen(js_name = plainFloats)]
-    pub fn plain_floats(&self, which: usize) -> Vec<f32> {
-        self.plain_scene().map_or_else(Vec::new, |s| if which == 0 { s.gaussians.clone() } else { s.coefficients.clone() })
-    }
-    /// For WebGL2: the harmonics (0), the starts (1), or per segment where starts and coefficients of the centres begin (2; all ones where centres do not move).
-    #[wasm_bindgen(js_name = plainWords)]
-    pub fn plain_words(&self, which: usize) -> Vec<u32> {
-        self.plain_scene().map_or_else(Vec::new, |s| match which {
-            0 => s.harmonics.clone(),
-            1 => s.starts.clone(),
-            _ => s.tracks.iter().flat_map(|tracks| tracks[Head::Means as usize].map_or([u32::MAX; 2], <[u32; 2]>::from)).collect(),
-        })
-    }
-    /// For WebGL2: the uniforms of a frame.
-    #[wasm_bindgen(js_name = plainFrame)]
-    pub fn plain_frame(&self, camera: Option<String>, time: Option<f32>) -> Result<Vec<u8>, JsError> {
-        let view = self.view_of(camera, time)?;
-        let empty;
-        let scene = match self.plain_scene() {
-            Some(scene) => scene,
-            None => {
-                empty = Scene::new(&Default::default(), None).map_err(error)?;
-                &empty
-            }
-        };
-        let (_, heads) = functions(scene, view.time);
-        Ok(bytemuck::bytes_of(&Frame::new(scene, &view, view.background.unwrap_or(scene.background), heads)).to_vec())
-    }
-    /// For WebGL2: φ at a time.
-    #[wasm_bindgen(js_name = plainFunctions)]
-    pub fn plain_functions(&self, time: Option<f32>) -> Vec<f32> {
-        self.plain_scene().map_or_else(Vec::new, |s| functions(s, time.unwrap_or(self.clock.time)).0)
     }
     /// Moves the clock on; whether time changed.
     pub fn tick(&mut self, elapsed_s: f32) -> bool {

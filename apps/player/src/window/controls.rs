@@ -8,6 +8,25 @@ use std::sync::atomic::Ordering;
 
 /// Share of the distance to the target that is flown per second.
 const FLIGHT: f64 = 1.0;
+/// Angle in radians that a press of an arrow key turns by, and how many times nearer a press of plus comes.
+const TURN: f64 = 0.08;
+const NEARER: f64 = 1.1;
+/// What mouse and keys do, for the settings.
+const HELP: [(&str, &str); 10] = [
+    ("drag, arrow keys", "orbit"),
+    ("shift-drag, right button", "pan"),
+    ("wheel, pinch, + and -", "zoom"),
+    ("W A S D Q E", "fly"),
+    ("F", "drag to look, or to orbit"),
+    ("R", "first view"),
+    ("Space, comma, full stop", "play, a frame back and on"),
+    ("Home, End", "first and last frame"),
+    ("X, T", "exact images, tint what moves"),
+    ("P, C, O", "save a PNG, print the command, open a path"),
+];
+
+/// What a key does.
+type Act = fn(&mut Window);
 
 /// A line with `text` at the top; whether it was closed.
 fn closed(ui: &mut egui::Ui, id: &'static str, text: &str) -> bool {
@@ -47,8 +66,8 @@ impl Window {
             });
         }
         drop(trouble);
-        if !self.remarks.is_empty() && closed(ui, "remarks", &self.remarks) {
-            self.remarks.clear();
+        if !self.read && !self.remarks.is_empty() && closed(ui, "remarks", &self.remarks) {
+            self.read = true;
         }
         if self.notice.as_deref().is_some_and(|text| closed(ui, "notice", text)) {
             self.notice = None;
@@ -109,7 +128,8 @@ impl Window {
             }
             ui.toggle_value(&mut self.flying, "Fly (F)").on_hover_text("W A S D Q E, drag to look");
         });
-        let degree = self.renderer.scene().map_or(0, |s| s.sh_degree);
+        // Exact images have all degrees.
+        let degree = self.renderer.scene().map_or(0, |s| if self.exact.is_on() { s.sh_degree } else { s.drawn_degree });
         ui.add(egui::Slider::new(&mut self.look.scale, 0.1..=2.0).text("Size"));
         // A wish for more than this model has is kept for the next one.
         let mut shown = self.look.sh_degree.min(degree);
@@ -137,6 +157,15 @@ impl Window {
                 }
             }
         });
+        ui.collapsing("Mouse and keys", |ui| {
+            egui::Grid::new("help").show(ui, |ui| {
+                for (keys, action) in HELP {
+                    ui.small(keys);
+                    ui.small(action);
+                    ui.end_row();
+                }
+            });
+        });
         ui.separator();
         if let Some(scene) = self.renderer.scene() {
             ui.small(format!("{:.0} frames/s", self.rate));
@@ -150,35 +179,52 @@ impl Window {
             }
             ui.small(adapter);
         }
-        if self.lacks_motion {
-            ui.small("No playback layer: the model stands still.");
-        }
+    }
+    /// Orbits, or looks around while flying.
+    fn turn(&mut self, right: f64, upwards: f64) {
+        if self.flying { self.navigator.look(right, upwards) } else { self.navigator.orbit(right, upwards) }
     }
     pub(super) fn keys(&mut self, ctx: &egui::Context, elapsed_s: f64) {
-        use egui::Key;
+        use egui::{Event, Key};
+        // Whatever has the focus of the Tab key takes the keys.
         if ctx.egui_wants_keyboard_input() {
             return;
         }
+        let again: [(Key, Act); 11] = [
+            (Key::Comma, |w| w.clock.step(-1)),
+            (Key::Period, |w| w.clock.step(1)),
+            (Key::Home, |w| w.clock.seek(0.0)),
+            (Key::End, |w| w.clock.seek(1.0)),
+            (Key::ArrowLeft, |w| w.turn(-TURN, 0.0)),
+            (Key::ArrowRight, |w| w.turn(TURN, 0.0)),
+            (Key::ArrowUp, |w| w.turn(0.0, TURN)),
+            (Key::ArrowDown, |w| w.turn(0.0, -TURN)),
+            (Key::Plus, |w| w.navigator.zoom(NEARER)),
+            (Key::Equals, |w| w.navigator.zoom(NEARER)),
+            (Key::Minus, |w| w.navigator.zoom(1.0 / NEARER)),
+        ];
+        // Held down, these act once.
+        let once: [(Key, Act); 8] = [
+            (Key::Space, |w| w.clock.play(!w.clock.playing)),
+            (Key::R, |w| w.navigator.reset()),
+            (Key::F, |w| w.flying = !w.flying),
+            (Key::T, |w| w.look.tint ^= !w.exact.is_on()),
+            (Key::X, |w| w.exact.set(!w.exact.is_on())),
+            (Key::P, Self::save_png),
+            (Key::C, Self::print_command),
+            (Key::O, Self::ask_for_a_file),
+        ];
+        let pressed = |event: &Event| match event {
+            Event::Key { key, pressed: true, repeat, modifiers, .. } if !(modifiers.ctrl || modifiers.command || modifiers.alt) => Some((*key, *repeat)),
+            _ => None,
+        };
         let (pressed, held) = ctx.input(|i| {
-            let pressed = [Key::Space, Key::Comma, Key::Period, Key::R, Key::F, Key::T, Key::X, Key::Home, Key::End, Key::P, Key::O].map(|k| i.key_pressed(k));
+            let pressed: Vec<(Key, bool)> = i.events.iter().filter_map(pressed).collect();
             (pressed, [Key::D, Key::A, Key::E, Key::Q, Key::W, Key::S].map(|k| f64::from(u8::from(i.key_down(k)))))
         });
-        let actions: [fn(&mut Self); 11] = [
-            |w| w.clock.play(!w.clock.playing),
-            |w| w.clock.step(-1),
-            |w| w.clock.step(1),
-            |w| w.navigator.reset(),
-            |w| w.flying = !w.flying,
-            |w| w.look.tint ^= !w.exact.is_on(),
-            |w| w.exact.set(!w.exact.is_on()),
-            |w| w.clock.seek(0.0),
-            |w| w.clock.seek(1.0),
-            Self::save_png,
-            Self::ask_for_a_file,
-        ];
-        pressed.iter().zip(actions).filter(|(pressed, _)| **pressed).for_each(|(_, act)| act(self));
-        if ctx.input(|i| i.key_pressed(Key::C)) {
-            self.print_command();
+        for (key, repeat) in pressed {
+            let acts = again.iter().chain(once.iter().filter(|_| !repeat));
+            acts.filter(|(of, _)| *of == key).for_each(|(_, act)| act(self));
         }
         // For tests, which have no other way to lose a device.
         if ctx.input_mut(|i| i.consume_key(egui::Modifiers::CTRL | egui::Modifiers::SHIFT, Key::F12)) {

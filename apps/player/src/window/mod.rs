@@ -116,9 +116,9 @@ struct Window {
     /// What was done.
     notice: Option<String>,
     lost: Lost,
-    lacks_motion: bool,
-    /// What the file holds and is not shown; empty once it was read.
+    /// What the file holds and is not shown, and whether that was read.
     remarks: String,
+    read: bool,
     /// Size of the file; 0 where there is none.
     bytes: u64,
     /// Whether a model has been shown.
@@ -164,8 +164,8 @@ impl Window {
             trouble,
             notice: None,
             lost,
-            lacks_motion: false,
             remarks: String::new(),
+            read: false,
             bytes: 0,
             loaded: false,
             resolution: 1.0,
@@ -198,8 +198,9 @@ impl Window {
         Ok(window)
     }
     /// Shows `content`; the first one sets camera and clock, later ones leave them.
-    fn load(&mut self, content: Content) -> Result<()> {
-        let Content { scene, presentation, frame_count, lacks_motion, remarks, bytes } = content;
+    fn load(&mut self, mut content: Content) -> Result<()> {
+        content.fit_harmonics(self.renderer.most_words(), "a buffer of this graphics device", "Use a device with larger buffers to see all");
+        let Content { scene, presentation, frame_count, lacks_motion: _, remarks, bytes } = content;
         let ([lower, upper], seconds) = (scene.bounds, presentation.seconds_of(frame_count));
         self.renderer.load(scene)?;
         if !self.loaded {
@@ -207,8 +208,10 @@ impl Window {
             self.clock = Clock::new(frame_count, seconds);
         }
         (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
-        (self.cameras, self.lacks_motion, self.remarks) = (presentation.cameras, lacks_motion, remarks.join(" "));
-        (self.bytes, self.loaded) = (bytes, true);
+        let remarks = remarks.join(" ");
+        // What every model of a training leaves out is read once.
+        self.read &= self.loaded && remarks == self.remarks;
+        (self.cameras, self.remarks, self.bytes, self.loaded) = (presentation.cameras, remarks, bytes, true);
         Ok(())
     }
     /// Takes what the training offered.
@@ -261,7 +264,8 @@ impl Window {
             self.renderer.draw(&view, &image.view);
             image.id
         });
-        let image = egui::Image::from_texture((id, available)).sense(egui::Sense::click_and_drag());
+        // No stop of the Tab key: what has its focus takes the keys.
+        let image = egui::Image::from_texture((id, available)).sense(egui::Sense::CLICK | egui::Sense::DRAG);
         let response = ui.add(image);
         self.gestures(ui, &response);
         if self.exact.is_on() {

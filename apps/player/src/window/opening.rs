@@ -1,6 +1,7 @@
 //! Files that are opened while the window shows another: dropped ones, and those whose path is typed.
 
 use super::{Open, Opened, Window, titled};
+use crate::desktop::start::busy_with_training;
 use cc4dgs_format::{Error, Result};
 use eframe::egui;
 use std::path::{Path, PathBuf};
@@ -31,9 +32,9 @@ impl Window {
     pub(super) fn file(&self) -> Option<&Path> {
         self.source.as_ref().map(|source| source.path.as_path())
     }
-    /// Begins to open `path`; of several, the last is shown.
+    /// Begins to open `path`; of several, the last is shown. A window of a training says what opens it.
     fn begin(&mut self, path: PathBuf, ctx: &egui::Context) {
-        let Some(source) = &self.source else { return };
+        let Some(source) = &self.source else { return self.complain(busy_with_training(&path)) };
         match Opening::new(path, source.open.clone(), ctx.clone()) {
             Ok(opening) => self.opening = Some(opening),
             Err(e) => self.complain(e.to_string()),
@@ -98,9 +99,8 @@ impl Window {
     }
     /// Shows the line to type a path into.
     pub(super) fn ask_for_a_file(&mut self) {
-        if let Some(source) = &self.source {
-            let folder = source.path.parent().filter(|p| !p.as_os_str().is_empty());
-            self.typed = Some(folder.map_or_else(String::new, |p| format!("{}{}", p.display(), std::path::MAIN_SEPARATOR)));
-        }
+        let Some(source) = &self.source else { return self.complain(busy_with_training(Path::new("FILE"))) };
+        let folder = source.path.parent().filter(|p| !p.as_os_str().is_empty());
+        self.typed = Some(folder.map_or_else(String::new, |p| format!("{}{}", p.display(), std::path::MAIN_SEPARATOR)));
     }
 }
