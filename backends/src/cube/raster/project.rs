@@ -90,6 +90,13 @@ fn length_of(range: u32) -> u32 {
     select(end > first, end - first, 0u32)
 }
 
+/// Whether scales and opacity of a Gaussian are finite as they are stored: a log-scale of -infinity is a scale of 0, and a logit of infinity an opacity of 1.
+#[cube]
+fn stored_finite(scales: &[f32], opacities: &[f32], i: usize) -> bool {
+    let s = load3(scales, 3 * i);
+    is_finite(s.x) && is_finite(s.y) && is_finite(s.z) && is_finite(opacities[i])
+}
+
 #[cube]
 fn all_finite(mean: V3, s: V3, q: V4, opacity: f32, p: Projected) -> bool {
     is_finite(mean.x)
@@ -149,6 +156,7 @@ pub fn project_gaussians(
         let mut columns = tiles_of_span(p.center_x - half_width, p.center_x + half_width, width);
         let mut rows = tiles_of_span(p.center_y - half_height, p.center_y + half_height, height);
         let seen = all_finite(mean, s, q, opacity, p)
+            && stored_finite(scales, opacities, i)
             && is_finite(half_width)
             && is_finite(half_height)
             && p.point.z > cam[NEAR]

@@ -120,6 +120,11 @@ impl ReferenceInput {
             view: std::array::from_fn(|r| std::array::from_fn(|c| number(settings.world_to_camera[r][c], 11 + 4 * r + c))),
         }
     }
+    /// Whether centre, scales, quaternion and opacity of Gaussian `i` are finite, as they are stored.
+    fn is_finite(&self, i: usize) -> bool {
+        let stored = [&self.means[3 * i..3 * i + 3], &self.scales[3 * i..3 * i + 3], &self.quaternions[4 * i..4 * i + 4], &self.opacities[i..=i]];
+        stored.into_iter().flatten().all(|v| v.is_finite())
+    }
     /// The coefficients of Gaussian `i` for basis function `k`.
     fn coefficient(&self, i: usize, k: usize) -> [f64; 3] {
         if k == 0 {
@@ -150,7 +155,7 @@ fn visible<T: Real>(input: &ReferenceInput, settings: &RasterSettings) -> (Vec<I
     let n = input.opacities.len();
     let mut radii = vec![0i64; n];
     let mut items = Vec::new();
-    for i in 0..n {
+    for i in (0..n).filter(|&i| input.is_finite(i)) {
         let exact: Projected<T> = gaussian::project(&input.gaussian(i, settings, |v, _| T::constant(v)), settings);
         let p = exact.widened();
         let Some((radius, tiles)) = gaussian::extent(&p, settings) else { continue };

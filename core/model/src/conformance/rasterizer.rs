@@ -122,9 +122,14 @@ impl Suite<'_> {
     fn odd_gaussians_are_left_out(&self) -> Result<Option<String>> {
         let clean = cloud(4);
         let truth = self.planes(&clean)?;
-        for (what, column, value) in
-            [("behind the camera", 0, -50.0), ("at infinity", 0, f32::INFINITY), ("not a number", 0, f32::NAN), ("of no opacity", 3, f32::NAN)]
-        {
+        for (what, column, value) in [
+            ("behind the camera", 0, -50.0),
+            ("at infinity", 0, f32::INFINITY),
+            ("not a number", 0, f32::NAN),
+            ("of no opacity", 3, f32::NAN),
+            ("whose opacity logit is infinite", 3, f32::INFINITY),
+            ("whose logarithm of a scale is infinite", 1, f32::NEG_INFINITY),
+        ] {
             let mut odd = cloud(5);
             if let Some((_, width, values)) = odd.columns_mut().into_iter().nth(column) {
                 values[5 * width - 1] = value;

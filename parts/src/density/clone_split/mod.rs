@@ -23,13 +23,15 @@ min_opacity = 0.005      # fainter Gaussians are removed
 max_scale_share = 0.0    # larger Gaussians are removed, as a share of the extent; 0 is off
 min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
 weight_every = 3000      # reference iterations between two weight prunings; 0 is off
-reset_every = 3000       # reference iterations between two opacity resets of the coarse stage; 0 is off
+reset_every = 3000       # reference iterations between two opacity resets of the coarse stage, to 0.01 or twice min_opacity; 0 is off
 reset_in_main = false    # reset opacities in the main stage, too, until the last round
 max_gaussians = 400000   # at this count or more, no Gaussians are added
 ";
 
-/// Opacity that a reset leaves at most.
+/// Opacity that a reset leaves at most; twice the opacity below which Gaussians are removed, if that is more.
 const RESET_OPACITY: f32 = 0.01;
+/// Largest opacity that a reset leaves, however large `min_opacity` is.
+const MOST_RESET_OPACITY: f32 = 0.99;
 /// Least number of iterations left in the stage after an opacity reset; later resets are skipped.
 const MIN_RECOVERY: usize = 500;
 /// Least number of iterations between two weight prunings, so that all views contribute blending weights.
@@ -83,6 +85,11 @@ impl Settings {
     /// The iteration of the stage at which rounds end.
     fn end(&self, schedule: &Schedule) -> usize {
         schedule.at(if schedule.stage == Stage::Coarse { self.until.min(Stage::Coarse.reference_length()) } else { self.until })
+    }
+    /// The largest opacity logit that a reset leaves: above that of Gaussians that are removed, so that a round does not take all of them.
+    fn reset_logit(&self) -> f32 {
+        let kept = 2.0 * self.min_opacity;
+        if kept > RESET_OPACITY { logit(kept.min(MOST_RESET_OPACITY)) } else { logit(RESET_OPACITY) }
     }
     fn weight_interval(&self, schedule: &Schedule) -> usize {
         schedule.at(self.weight_every).max(MIN_WEIGHT_INTERVAL).max(WEIGHT_PASSES * schedule.pass)
@@ -138,12 +145,11 @@ impl DensityControl for CloneSplit {
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
         let due = Due { held: self.held, ..self.settings.due(schedule) };
         self.due = due;
-        let mut plan = None;
-        let mut logits = None;
+        let (mut plan, mut logits, most) = (None, None, self.settings.reset_logit());
         if due.grow || due.prune_weight {
             let mut host = gaussians.to_host()?;
             if due.reset {
-                host.opacity_logits.iter_mut().for_each(|v| *v = v.min(reset_logit()));
+                host.opacity_logits.iter_mut().for_each(|v| *v = v.min(most));
             }
             plan = round(&self.settings, &self.statistics, &host, due, schedule.extent, seed)?;
             logits = Some(host.opacity_logits);
@@ -156,7 +162,7 @@ impl DensityControl for CloneSplit {
             let plan = plan.get_or_insert_with(|| DensityPlan::unchanged(logits.len()));
             for row in 0..plan.len() {
                 let parent = plan.parents()[row];
-                plan.set(row, "opacity_logits", &[logits[parent].min(reset_logit())]);
+                plan.set(row, "opacity_logits", &[logits[parent].min(most)]);
             }
             plan.restart("opacity_logits");
         }
@@ -178,8 +184,8 @@ impl DensityControl for CloneSplit {
     }
 }
 
-fn reset_logit() -> f32 {
-    (RESET_OPACITY / (1.0 - RESET_OPACITY)).ln()
+fn logit(opacity: f32) -> f32 {
+    (opacity / (1.0 - opacity)).ln()
 }
 
 fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
@@ -219,12 +225,41 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::HostGaussians;
 
     #[test]
     fn thresholds_out_of_range_are_named() {
         for (section, key) in [("gradient = -1.0", "gradient"), ("min_weight = inf", "min_weight")] {
             let error = build(&toml::from_str(section).unwrap()).err().unwrap().to_string();
             assert!(error.contains(&format!("clone-split: {key}")) && error.contains("usual"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_reset_leaves_more_opacity_than_what_is_removed_has() {
+        let device = Device::flex();
+        let host = HostGaussians {
+            means: vec![0.0; 6],
+            log_scales: vec![-3.0; 6],
+            quaternions: [1.0, 0.0, 0.0, 0.0].repeat(2),
+            opacity_logits: vec![2.0, 0.0],
+            sh_dc: vec![0.0; 6],
+            dynamic_scores: vec![0.0; 2],
+            ..Default::default()
+        };
+        // A round is due after the same iteration.
+        let schedule = Schedule { stage: Stage::Coarse, iteration: 3000, total: 28_000, ..Schedule::main(5000) };
+        for (min_opacity, left) in [(0.0f32, 0.01), (0.005, 0.01), (0.05, 0.1), (0.4, 0.8), (0.45, 0.9)] {
+            let mut control = build(&toml::from_str(&format!("weight_every = 0\nmin_opacity = {min_opacity:?}")).unwrap()).unwrap();
+            control.begin_stage(2, &device);
+            let gaussians = Gaussians::from_host(&host, &device);
+            let plan = control.plan(&gaussians, &schedule, Seed::root(1)).unwrap().unwrap();
+            assert!(plan.keeps_all(2) && plan.report.removed == 0, "min_opacity {min_opacity}: {:?}", plan.report);
+            let logits = plan.apply(&gaussians).unwrap().to_host().unwrap().opacity_logits;
+            for (after, before) in logits.iter().zip(&host.opacity_logits) {
+                let [after, before] = [after, before].map(|logit| 1.0 / (1.0 + (-logit).exp()));
+                assert!((after - before.min(left)).abs() < 1e-4, "min_opacity {min_opacity}: {before} becomes {after}");
+            }
         }
     }
 }
