@@ -22,6 +22,7 @@ center_lr = 1.6e-4       # Adam on T, as a share of the sequence
 width_lr = 5e-3          # Adam on the logarithms of r and s
 gate_lr = 1e-3           # Adam on the gate's logit over 20
 velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
+# velocity_lr_end = 1.6e-5   # the same at the end of the main stage, reached log-linearly (FreeTimeGS: a hundredth); no fall unless given
 ";
 
 /// Centres of life are spread over the sequence, and a tenth beyond either end.
@@ -41,6 +42,7 @@ struct Settings {
     width_lr: f64,
     gate_lr: f64,
     velocity_lr: f64,
+    velocity_lr_end: Option<f64>,
 }
 
 impl Default for Settings {
@@ -55,6 +57,7 @@ impl Default for Settings {
             width_lr: 5e-3,
             gate_lr: 1e-3,
             velocity_lr: 1.6e-3,
+            velocity_lr_end: None,
         }
     }
 }
@@ -66,8 +69,9 @@ struct FreeTime {
 
 impl FreeTime {
     fn new(settings: Settings) -> Result<Self> {
-        let Settings { half_width, falloff, gate, gate_weight, hidden_below, center_lr, width_lr, gate_lr, velocity_lr } = settings;
-        let life = LifeSettings { half_width, falloff, gate, spread: SPREAD, gate_weight, hidden_below, center_lr, width_lr, gate_lr, velocity_lr };
+        let Settings { half_width, falloff, gate, gate_weight, hidden_below, center_lr, width_lr, gate_lr, velocity_lr, velocity_lr_end } = settings;
+        let rates = LifeSettings { center_lr, width_lr, gate_lr, velocity_lr, velocity_lr_end, ..LifeSettings::default() };
+        let life = LifeSettings { half_width, falloff, gate, spread: SPREAD, gate_weight, hidden_below, ..rates };
         Ok(Self { life: Life::new(life)? })
     }
 }

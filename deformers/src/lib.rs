@@ -57,8 +57,8 @@ mod tests {
             ("embedding", "lr_start lr_end gaussian_lr smooth_weight smooth_falloff"),
             ("deform-mlp", "lr_start lr_end"),
             ("native-4d", "time_lr duration_lr velocity_lr color_lr"),
-            ("free-time", "center_lr width_lr gate_lr velocity_lr gate_weight"),
-            ("life", "center_lr width_lr gate_lr velocity_lr gate_weight"),
+            ("free-time", "center_lr width_lr gate_lr velocity_lr velocity_lr_end gate_weight"),
+            ("life", "center_lr width_lr gate_lr velocity_lr velocity_lr_end gate_weight"),
         ] {
             for name in settings.split(' ') {
                 for value in ["-1e-3", "nan", "inf", "1e300"] {

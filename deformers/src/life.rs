@@ -23,6 +23,7 @@ center_lr = 1.6e-4       # Adam on T, as a share of the sequence
 width_lr = 5e-3          # Adam on the logarithms of r and s
 gate_lr = 0.0            # Adam on the gate's logit over 20
 velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
+# velocity_lr_end = 1.6e-5   # the same at the end of the main stage, reached log-linearly (FreeTimeGS: a hundredth); no fall unless given
 ";
 
 /// A deformer whose Gaussians have lives too.

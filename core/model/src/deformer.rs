@@ -133,7 +133,8 @@ impl SpatialInput {
 }
 
 /// A number or vector per Gaussian that a deformer learns in addition to its weights. It is one of the Gaussians' extra attributes: density control copies and
-/// removes it with its Gaussian, and checkpoints and archives store it by name. Gaussians that key frames or recovery add take the value of the nearest moving one.
+/// removes it with its Gaussian, and checkpoints and archives store it by name. It begins with the main stage. Gaussians that key frames or recovery add take the
+/// value of the nearest moving one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AttributeSpec {
     /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and not one of the attributes that every Gaussian has.
@@ -144,9 +145,12 @@ pub struct AttributeSpec {
     pub start: f32,
     /// Start values are uniform random numbers from `start - spread` to `start + spread`, from the run's seed.
     pub spread: f32,
-    /// Learning rate of the optimizer.
+    /// Learning rate of the optimizer at the first step of the main stage.
     pub lr: f64,
-    /// Whether the rate is multiplied by the extent of the cameras in the normalised frame, [`crate::Scene::extent`] (as that of the positions is).
+    /// Learning rate at the last step of the main stage, reached log-linearly, as that of a [`ParameterGroup`]. `None`: `lr` in all of it. The trainer's
+    /// `train.lr.cooldown` counts in addition.
+    pub lr_end: Option<f64>,
+    /// Whether the rates are multiplied by the extent of the cameras in the normalised frame, [`crate::Scene::extent`] (as that of the positions is).
     pub times_extent: bool,
     /// Largest absolute error of a float after lossy compression. `None`: codecs that measure what errors change in images round by that, others store it
     /// bit for bit.
@@ -154,9 +158,9 @@ pub struct AttributeSpec {
 }
 
 impl AttributeSpec {
-    /// An attribute of `width` floats with start value `start` and learning rate `lr`, without a tolerance.
+    /// An attribute of `width` floats with start value `start` and a learning rate of `lr` throughout, without a tolerance.
     pub fn new(name: &str, width: usize, start: f32, lr: f64) -> Self {
-        Self { name: name.into(), width, start, spread: 0.0, lr, times_extent: false, tolerance: None }
+        Self { name: name.into(), width, start, spread: 0.0, lr, lr_end: None, times_extent: false, tolerance: None }
     }
 }
 
@@ -183,8 +187,9 @@ pub fn check_attributes(deformer: &str, attributes: &[AttributeSpec]) -> Result<
         if spec.width == 0 || spec.width > 4096 {
             return bad(&spec.name, &format!("the width {} is not in 1..4096", spec.width));
         }
-        if [spec.start, spec.spread, spec.lr as f32, spec.tolerance.unwrap_or(0.0)].iter().any(|v| !v.is_finite()) {
-            return bad(&spec.name, "start, spread, rate and tolerance must be finite");
+        let rates = [spec.lr, spec.lr_end.unwrap_or(0.0)].map(|rate| rate as f32);
+        if [spec.start, spec.spread, rates[0], rates[1], spec.tolerance.unwrap_or(0.0)].iter().any(|v| !v.is_finite()) {
+            return bad(&spec.name, "start, spread, rates and tolerance must be finite");
         }
     }
     Ok(())
@@ -252,7 +257,8 @@ pub trait Deformer: Send {
         false
     }
     /// An additional loss term `[1]` for the moving Gaussians, added as it is. It is asked for once per iteration, with the time `time_norm` (0..1) of the first view
-    /// of that iteration and the `progress` (0..1) of the main stage.
+    /// of that iteration and the `progress` (0..1) of the main stage. It may call [`Deformer::deform`] at other times, to compare several. Add many numbers with
+    /// [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }

@@ -1,29 +1,60 @@
 //! Loss terms: what training minimises, as a weighted sum.
 
 use crate::Plugin;
-use crate::{Gaussians, Result, Schedule};
-use burn::tensor::Tensor;
+use crate::{Camera, Gaussians, Result, Schedule, View};
+use burn::tensor::{Int, Tensor};
 
-/// Input of a loss term: one view at one time.
+/// Input of a loss term: one view at one time. More may be added to it, so programs make one with [`LossInput::new`].
+#[derive(Clone, Copy)]
+#[non_exhaustive]
 pub struct LossInput<'a> {
     /// Rendered planes `[5,H,W]`: red, green, blue as the camera records them (after the appearance model), alpha, depth. Gradients flow through them. In the score
     /// stage (`[score_loss]`) the first three are the blended dynamic scores, and gradients reach nothing else.
     pub planes: &'a Tensor<3>,
     /// Recorded planes `[3,H,W]` in 0..1, or the mask `[1,H,W]` of the score stage.
     pub target: &'a Tensor<3>,
-    /// The Gaussians as rendered at this time, with their attributes (opacities and scales before activation). Gradients flow through them.
+    /// The camera of the view, at the size of the planes. Its name is that of the dataset.
+    pub camera: &'a Camera,
+    /// The view: its frame among those that the scene has, counted from 0, and its time.
+    pub view: &'a View,
+    /// The Gaussians as rendered at this time, with their attributes (opacities and scales before activation). Gradients flow through them. Attributes of a
+    /// deformer are in [`Gaussians::extra`] during the main stage only.
     pub gaussians: &'a Gaussians,
+    /// The same Gaussians before the deformer, row by row, with the same attributes; where nothing moves they are equal. Gradients flow through them, as through
+    /// `gaussians`, to the values that training learns. With `train.sparse_adam` (the default) an iteration changes only Gaussians that one of its views shows.
+    /// Where offsets are added, the difference of the two has a gradient for the deformer alone.
+    pub canonical: &'a Gaussians,
     /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
-    pub radii: &'a Tensor<1, burn::tensor::Int>,
+    pub radii: &'a Tensor<1, Int>,
     /// Normalised time of the view, 0..1.
     pub time_norm: f32,
     /// The current iteration of training.
     pub schedule: &'a Schedule,
 }
 
+impl<'a> LossInput<'a> {
+    /// What is seen of `gaussians` by `camera` in `view`; the fields say what the arguments are. The Gaussians stand still: `canonical` is `gaussians`.
+    pub fn new(
+        camera: &'a Camera,
+        view: &'a View,
+        planes: &'a Tensor<3>,
+        target: &'a Tensor<3>,
+        gaussians: &'a Gaussians,
+        radii: &'a Tensor<1, Int>,
+        schedule: &'a Schedule,
+    ) -> Self {
+        Self { planes, target, camera, view, gaussians, canonical: gaussians, radii, time_norm: view.time_norm, schedule }
+    }
+    /// The same view of Gaussians that a deformer moved from `canonical`, which has as many.
+    pub fn moved_from(self, canonical: &'a Gaussians) -> Self {
+        Self { canonical, ..self }
+    }
+}
+
 /// One term of the loss.
 pub trait LossTerm: Send {
-    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training.
+    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training. Add many numbers
+    /// with [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
 }
 

@@ -4,7 +4,7 @@
 //! as flat arrays and calls the author's functions with a module that has the current weights. So a new deformer consists of its layers, two functions and a
 //! registration.
 
-use crate::{AttributeSpec, Deformer, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures, SpatialInput};
+use crate::{AttributeSpec, Deformer, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures, SpatialInput};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
@@ -26,6 +26,8 @@ pub struct ModuleDeformer<M, S, D> {
     regularizer: Option<Regularizer<M>>,
     progress: Option<Progress<M>>,
     cached: bool,
+    /// Beginnings of paths that were asked for and that no weight has.
+    unmatched: Vec<String>,
 }
 
 impl<M, S, D> ModuleDeformer<M, S, D>
@@ -35,7 +37,7 @@ where
     D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
 {
     /// A deformer whose weights are all float weights of `module`, in one optimizer group and counted as network. Names are paths of the module tree
-    /// (`trunk.0.weight`).
+    /// (`trunk.0.weight`). Errors name the deformer by the name of `group`.
     pub fn new(module: M, group: ParameterGroup, spatial: S, deform: D) -> Self {
         let mut list = Collector { path: Vec::new(), parameters: Vec::new() };
         module.visit(&mut list);
@@ -49,6 +51,7 @@ where
             regularizer: None,
             progress: None,
             cached: true,
+            unmatched: Vec::new(),
         }
     }
     /// Adds attributes per Gaussian; `spatial` receives their values in [`SpatialInput::attributes`], in this order.
@@ -66,20 +69,40 @@ where
         self.progress = Some(Box::new(change));
         self
     }
-    /// Counts weights whose path starts with `prefix` as grid, and puts them into their own optimizer group if `group` is given.
+    /// Counts weights whose path starts with `prefix` as grid, and puts them into an optimizer group of their own if `group` is given. A path that no weight has is
+    /// an error as for [`ModuleDeformer::with_group`].
     pub fn with_grid(mut self, prefix: &str, group: Option<ParameterGroup>) -> Self {
-        let index = match group {
-            Some(group) => {
-                self.groups.push(group);
-                self.groups.len() - 1
-            }
-            None => 0,
-        };
-        for parameter in self.parameters.iter_mut().filter(|p| p.name.starts_with(prefix)) {
-            parameter.part = Part::Grid;
-            parameter.group = index;
+        self.change(prefix, |parameter| parameter.part = Part::Grid);
+        match group {
+            Some(group) => self.with_group(prefix, group),
+            None => self,
         }
+    }
+    /// Puts weights whose path starts with `prefix` into an optimizer group of their own, such as a head that learns faster than the trunk. Where no weight has
+    /// such a path, every call of [`Deformer::spatial`] is an error that lists the paths.
+    pub fn with_group(mut self, prefix: &str, group: ParameterGroup) -> Self {
+        let index = self.groups.len();
+        self.groups.push(group);
+        self.change(prefix, |parameter| parameter.group = index);
         self
+    }
+    /// Changes the weights whose path starts with `prefix`.
+    fn change(&mut self, prefix: &str, change: impl Fn(&mut Parameter)) {
+        let mut found = false;
+        for parameter in self.parameters.iter_mut().filter(|p| p.name.starts_with(prefix)) {
+            change(parameter);
+            found = true;
+        }
+        if !found {
+            self.unmatched.push(prefix.into());
+        }
+    }
+    /// Refuses beginnings of paths that no weight has.
+    fn check_paths(&self) -> Result<()> {
+        let Some(prefix) = self.unmatched.first() else { return Ok(()) };
+        let paths: Vec<&str> = self.parameters.iter().map(|p| p.name.as_str()).collect();
+        let remedy = format!("Give with_grid and with_group the beginning of one of {}", paths.join(", "));
+        Err(Error::parameter(format!("deformer {}: weights '{prefix}'", self.groups[0].name), "no weight has a path that starts so", remedy))
     }
     /// Sets whether playback may cache spatial features between frames; default: true.
     pub fn with_cache(mut self, cached: bool) -> Self {
@@ -99,6 +122,7 @@ where
     D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
 {
     fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        self.check_paths()?;
         input.check(&self.groups[0].name, &self.attributes)?;
         let work = DeformerWork { gaussians: input.len() as u64, ..DeformerWork::default() };
         Ok(SpatialFeatures { values: (self.spatial)(&self.current(), input)?, work })
@@ -221,5 +245,27 @@ mod tests {
         // d/dV = features^T 1 t: two Gaussians, each with feature 1.5, half way through time.
         let gradient = field.parameters()[1].value.grad(&gradients).unwrap();
         assert_eq!(to_vec(gradient, "gradient").unwrap(), vec![1.5; 9]);
+    }
+
+    #[test]
+    fn weights_have_groups_of_their_own() {
+        let device = Device::flex();
+        let field = |prefix: &str| {
+            let param = || Param::from_tensor(Tensor::<2>::ones([3, 3], &device));
+            let spatial = |m: &Drift, input: &SpatialInput| Ok(input.means_world.clone().matmul(m.table.val()));
+            let deform = |m: &Drift, features: Tensor<2>, t: f32| Ok(Offsets { means: Some(features.matmul(m.velocity.val()) * t), ..Offsets::default() });
+            ModuleDeformer::new(Drift { table: param(), velocity: param() }, ParameterGroup::plain("drift", 1e-3, 1e-4), spatial, deform)
+                .with_group(prefix, ParameterGroup::plain("fast", 1e-2, 1e-3))
+                .with_grid("table", None)
+        };
+        let groups = |prefix: &str| field(prefix).parameters().iter().map(|p| (p.part, p.group)).collect::<Vec<_>>();
+        assert_eq!(groups("velocity"), [(Part::Grid, 0), (Part::Net, 1)]);
+        assert_eq!(groups("table"), [(Part::Grid, 1), (Part::Net, 0)], "counting as grid changes no group");
+        assert_eq!(field("velocity").groups()[1], ParameterGroup::plain("fast", 1e-2, 1e-3));
+
+        let input = SpatialInput::new(Tensor::ones([2, 3], &device));
+        assert!(field("velocity").spatial(&input).is_ok());
+        let error = field("speed").spatial(&input).unwrap_err().to_string();
+        assert!(error.starts_with("deformer drift: weights 'speed'") && error.contains("table, velocity"), "{error}");
     }
 }

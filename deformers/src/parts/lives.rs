@@ -34,6 +34,9 @@ pub struct LifeSettings {
     pub gate_lr: f64,
     /// Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame.
     pub velocity_lr: f64,
+    /// The same at the end of the main stage, reached log-linearly (FreeTimeGS: a hundredth of it); `None` is no fall.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub velocity_lr_end: Option<f64>,
 }
 
 impl Default for LifeSettings {
@@ -50,6 +53,7 @@ impl Default for LifeSettings {
             width_lr: 5e-3,
             gate_lr: 0.0,
             velocity_lr: 1.6e-3,
+            velocity_lr_end: None,
         }
     }
 }
@@ -71,6 +75,7 @@ impl Life {
             ("width_lr of lives", s.width_lr),
             ("gate_lr of lives", s.gate_lr),
             ("velocity_lr of lives", s.velocity_lr),
+            ("velocity_lr_end of lives", s.velocity_lr_end.unwrap_or(0.0)),
         ])?;
         let limits = [
             ("half_width", settings.half_width, 1e-4, 10.0),
@@ -92,8 +97,11 @@ impl Life {
         let s = &self.settings;
         let starts = [(0.5, s.spread), (s.half_width.ln(), 0.0), (s.falloff.ln(), 0.0), (gate_value(s.gate), 0.0), (0.0, 0.0)];
         let rates = [s.center_lr, s.width_lr, s.width_lr, s.gate_lr, s.velocity_lr];
-        let spec =
-            |(((name, width), (start, spread)), lr)| AttributeSpec { spread, times_extent: name == "velocity", ..AttributeSpec::new(name, width, start, lr) };
+        let spec = |(((name, width), (start, spread)), lr)| {
+            let moves = name == "velocity";
+            let lr_end = s.velocity_lr_end.filter(|_| moves);
+            AttributeSpec { spread, lr_end, times_extent: moves, ..AttributeSpec::new(name, width, start, lr) }
+        };
         LIFE_ATTRIBUTES.into_iter().zip(starts).zip(rates).map(spec).collect()
     }
     /// The settings.
@@ -138,5 +146,17 @@ mod tests {
         let at = |time_norm: f32| life.at(Tensor::zeros([0, WIDTH], &Device::flex()), &[0.5, time_norm], true);
         assert!(at(f32::NAN).is_err() && at(f32::INFINITY).is_err());
         assert_eq!(at(0.2).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn the_rate_of_velocities_alone_falls_and_only_where_it_is_stated() {
+        let ends = |settings: &str| {
+            let life = Life::new(toml::from_str(settings).unwrap()).unwrap();
+            life.attributes().into_iter().map(|a| (a.lr, a.lr_end)).collect::<Vec<_>>()
+        };
+        assert_eq!(ends("velocity_lr_end = 1.6e-5"), [(1.6e-4, None), (5e-3, None), (5e-3, None), (0.0, None), (1.6e-3, Some(1.6e-5))]);
+        assert!(ends("velocity_lr = 0.1").iter().all(|(_, end)| end.is_none()));
+        // What is not stated is not stored either.
+        assert!(!toml::Table::try_from(LifeSettings::default()).unwrap().contains_key("velocity_lr_end"));
     }
 }

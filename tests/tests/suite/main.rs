@@ -27,6 +27,7 @@ mod image;
 mod links;
 mod lives;
 mod lookup;
+mod loss_inputs;
 mod manifests;
 mod observer;
 mod orbit;

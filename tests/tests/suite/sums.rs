@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformerContext, Gaussians, HostGaussians, LIFE_ATTRIBUTES, LossInput, Registry, Schedule, Seed, SpatialInput};
+use cc4dgs_core::{Camera, DeformerContext, Gaussians, HostGaussians, LIFE_ATTRIBUTES, LossInput, Registry, Schedule, Seed, SpatialInput, Split, View};
 use cc4dgs_deformers as _;
 use cc4dgs_parts as _;
 
@@ -50,7 +50,9 @@ fn loss_terms_of_many_gaussians_do_not_depend_on_threads() {
             (gaussians.log_scales, gaussians.opacity_logits) = (tensor([MANY.div_ceil(3), 3]), tensor([MANY]));
             let (planes, target) = (Tensor::zeros([5, 1, 1], &device), Tensor::zeros([3, 1, 1], &device));
             let (radii, schedule) = (Tensor::<1, Int>::zeros([1], &device), Schedule::main(10));
-            let input = LossInput { planes: &planes, target: &target, gaussians: &gaussians, radii: &radii, time_norm: 0.5, schedule: &schedule };
+            let camera = Camera::look_at("a camera", (1, 1), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+            let view = View { camera: 0, frame: 0, time_norm: 0.5, split: Split::Train };
+            let input = LossInput::new(&camera, &view, &planes, &target, &gaussians, &radii, &schedule);
             build(&toml::Table::new()).unwrap().value(&input).unwrap().unwrap()
         });
     }

@@ -7,8 +7,8 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    AttributeSpec, CodecContext, Deformer, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Result, Schedule, Seed, Silent, SpatialInput,
-    StepSettings, WeightArray, split_kind, toml,
+    AttributeSpec, Camera, CodecContext, Deformer, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Result, Schedule, Seed, Silent, SpatialInput,
+    Split, StepSettings, View, WeightArray, split_kind, toml,
 };
 
 /// Centres per deformer.
@@ -164,7 +164,8 @@ fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
         dynamic_scores: vec![0.0],
         ..Default::default()
     };
-    let schedule = Schedule::main(100);
+    let camera = Camera::look_at("stress", (SIZE[1] as u32, SIZE[0] as u32), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+    let (view, schedule) = (View { camera: 0, frame: 0, time_norm: 0.5, split: Split::Train }, Schedule::main(100));
     for level in [0.0f32, 1.0, 1e4, 1e10, 1e18] {
         let planes: Vec<f32> = draw(1, 5 * pixels).into_iter().map(|v| level * v).collect();
         let values = |device: &Device| -> Result<Vec<f32>> {
@@ -173,7 +174,7 @@ fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
             let (planes, target) = (tensor(&planes), tensor(&target));
             let gaussians = Gaussians::from_host(&host, device);
             let radii = Tensor::<1, Int>::from_data(TensorData::new(vec![3i64], [1]), device);
-            let input = LossInput { planes: &planes, target: &target, gaussians: &gaussians, radii: &radii, time_norm: 0.5, schedule: &schedule };
+            let input = LossInput::new(&camera, &view, &planes, &target, &gaussians, &radii, &schedule);
             term.value(&input)?.map_or(Ok(vec![0.0]), |value| to_vec(value, "loss"))
         };
         let exact = || -> Result<Option<Vec<f32>>> {

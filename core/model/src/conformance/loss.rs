@@ -2,13 +2,17 @@
 
 use super::{guarded, settings_are_defaults, uniform, within};
 use crate::gaussians::to_vec;
-use crate::{Gaussians, HostGaussians, LossInput, LossPlugin, LossTerm, Registry, Result, Schedule, Seed};
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use crate::{AttributeSpec, Camera, ExtraAttribute, Gaussians, HostGaussians, LossInput, LossPlugin, LossTerm, Registry, Result, Schedule, Seed, Split, View};
+use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 
 /// Image size of the suite.
 const SIZE: [usize; 2] = [17, 23];
 /// Gaussians of the suite.
 const COUNT: usize = 6;
+/// How far apart a value as drawn and the canonical one are, at most.
+const OFFSET: f32 = 0.3;
+/// What findings write before the name of a canonical column.
+const CANONICAL: &str = "canonical ";
 /// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.05;
 /// By how much values change that have no gradient, and the largest relative change of the loss then.
@@ -21,11 +25,18 @@ const FUSED_TOLERANCE: f64 = 1e-4;
 ///
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - The value is one finite number and repeats bit for bit.
-/// - Gradients of the planes and of the Gaussians agree with finite differences.
+/// - Gradients of the planes, of the Gaussians as drawn and of the canonical ones agree with finite differences.
 /// - Images of one pixel and sets without Gaussians give a value or an error.
+/// - Where the Gaussians stand still, as in the coarse stage, value and gradients are finite.
 /// - A fused term is the weighted sum of the terms it replaces, which are looked up in `registry`.
 pub fn loss(plugin: &LossPlugin, settings: &toml::Table, registry: &Registry, device: &Device) -> Vec<String> {
-    let suite = Suite { plugin, settings, registry, device };
+    loss_of_attributes(plugin, settings, &[], registry, device)
+}
+
+/// As [`loss`], for a term that reads attributes of a deformer in [`Gaussians::extra`]: the Gaussians have `attributes`, too, and gradients of these agree with
+/// finite differences. Gaussians without them, as in the coarse stage, give a value or `None`.
+pub fn loss_of_attributes(plugin: &LossPlugin, settings: &toml::Table, attributes: &[AttributeSpec], registry: &Registry, device: &Device) -> Vec<String> {
+    let suite = Suite { plugin, settings, attributes, registry, device };
     guarded(
         &format!("{} on {device:?}", plugin.info.name),
         vec![
@@ -33,6 +44,7 @@ pub fn loss(plugin: &LossPlugin, settings: &toml::Table, registry: &Registry, de
             ("value", Box::new(|| suite.value_is_a_number())),
             ("gradients", Box::new(|| suite.gradients_are_slopes())),
             ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
+            ("standing still", Box::new(|| suite.what_stands_still_has_a_gradient())),
             ("fusion", Box::new(|| suite.fused_is_the_sum())),
         ],
     )
@@ -41,6 +53,7 @@ pub fn loss(plugin: &LossPlugin, settings: &toml::Table, registry: &Registry, de
 struct Suite<'a> {
     plugin: &'a LossPlugin,
     settings: &'a toml::Table,
+    attributes: &'a [AttributeSpec],
     registry: &'a Registry,
     device: &'a Device,
 }
@@ -52,67 +65,137 @@ struct Inputs {
     planes: Vec<f32>,
     /// `[3,H,W]`.
     target: Vec<f32>,
+    /// As drawn.
     gaussians: HostGaussians,
+    canonical: HostGaussians,
     size: [usize; 2],
 }
 
-fn inputs(size: [usize; 2], count: usize) -> Inputs {
+/// What tracks gradients in one input.
+struct Leaves {
+    planes: Tensor<3>,
+    gaussians: Gaussians,
+    canonical: Gaussians,
+}
+
+impl Leaves {
+    /// Gradients by name, the planes' first; `None` where none arrives.
+    fn gradients(&self, gradients: &Gradients) -> Result<Vec<(String, Option<Vec<f32>>)>> {
+        fn flat<const D: usize>(values: &Tensor<D>, gradients: &Gradients) -> Result<Option<Vec<f32>>> {
+            values.grad(gradients).map(|gradient| to_vec(gradient, "gradient")).transpose()
+        }
+        let mut found = vec![("planes".to_string(), flat(&self.planes, gradients)?)];
+        for (prefix, g) in [("", &self.gaussians), (CANONICAL, &self.canonical)] {
+            let columns = [
+                ("means", flat(&g.means, gradients)?),
+                ("log_scales", flat(&g.log_scales, gradients)?),
+                ("quaternions", flat(&g.quaternions, gradients)?),
+                ("opacity_logits", flat(&g.opacity_logits, gradients)?),
+                ("sh_dc", flat(&g.sh_dc, gradients)?),
+                ("sh_rest", flat(&g.sh_rest, gradients)?),
+            ];
+            found.extend(columns.map(|(name, gradient)| (format!("{prefix}{name}"), gradient)));
+            for (name, values) in &g.extra {
+                found.push((format!("{prefix}{name}"), flat(values, gradients)?));
+            }
+        }
+        Ok(found)
+    }
+}
+
+/// The Gaussians as leaves.
+fn tracked(g: Gaussians) -> Gaussians {
+    Gaussians {
+        means: g.means.require_grad(),
+        log_scales: g.log_scales.require_grad(),
+        quaternions: g.quaternions.require_grad(),
+        opacity_logits: g.opacity_logits.require_grad(),
+        sh_dc: g.sh_dc.require_grad(),
+        sh_rest: g.sh_rest.require_grad(),
+        extra: g.extra.into_iter().map(|(name, values)| (name, values.require_grad())).collect(),
+        ..g
+    }
+}
+
+/// The input of a view of `size` with `count` Gaussians, which have `attributes` and were moved.
+fn inputs(size: [usize; 2], count: usize, attributes: &[AttributeSpec]) -> Inputs {
     let (seed, pixels) = (Seed::root(51), size[0] * size[1]);
     let draw = |shift: usize, k: usize| 0.5 + 0.45 * uniform(seed, 1_000_000 * shift + k);
     let columns = |width: usize, shift: usize, centre: f32| (0..count * width).map(|k| centre + uniform(seed, 2_000_000 * shift + k)).collect::<Vec<f32>>();
-    Inputs {
-        planes: (0..5 * pixels).map(|k| draw(1, k)).collect(),
-        target: (0..3 * pixels).map(|k| draw(2, k)).collect(),
-        gaussians: HostGaussians {
-            sh_degree: 1,
-            means: columns(3, 3, 0.0),
-            log_scales: columns(3, 4, -2.0),
-            quaternions: columns(4, 5, 1.5),
-            opacity_logits: columns(1, 6, 0.0),
-            sh_dc: columns(3, 7, 0.0),
-            sh_rest: columns(9, 8, 0.0),
-            dynamic_scores: columns(1, 9, 0.0),
-            ..Default::default()
-        },
-        size,
+    let gaussians = HostGaussians {
+        sh_degree: 1,
+        means: columns(3, 3, 0.0),
+        log_scales: columns(3, 4, -2.0),
+        quaternions: columns(4, 5, 1.5),
+        opacity_logits: columns(1, 6, 0.0),
+        sh_dc: columns(3, 7, 0.0),
+        sh_rest: columns(9, 8, 0.0),
+        dynamic_scores: columns(1, 9, 0.0),
+        extra: attributes
+            .iter()
+            .enumerate()
+            .map(|(index, spec)| (spec.name.clone(), ExtraAttribute::exact(spec.width, columns(spec.width, 10 + index, spec.start))))
+            .collect(),
+    };
+    let mut canonical = gaussians.clone();
+    for (index, (.., values)) in canonical.columns_mut().into_iter().filter(|(name, ..)| *name != "dynamic_scores").enumerate() {
+        let seed = Seed::root(53).index(index as u64);
+        values.iter_mut().enumerate().for_each(|(k, value)| *value += OFFSET * uniform(seed, k));
     }
+    let planes = (0..5 * pixels).map(|k| draw(1, k)).collect();
+    Inputs { planes, target: (0..3 * pixels).map(|k| draw(2, k)).collect(), gaussians, canonical, size }
+}
+
+/// The planes, or a column or attribute of the Gaussians by name.
+fn values_of<'a>(inputs: &'a mut Inputs, name: &str) -> Option<&'a mut Vec<f32>> {
+    if name == "planes" {
+        return Some(&mut inputs.planes);
+    }
+    let (set, name) = match name.strip_prefix(CANONICAL) {
+        Some(name) => (&mut inputs.canonical, name),
+        None => (&mut inputs.gaussians, name),
+    };
+    if set.extra.contains_key(name) {
+        return set.extra.get_mut(name).map(|attribute| &mut attribute.values);
+    }
+    set.columns_mut().into_iter().find(|(column, ..)| *column == name).map(|(.., values)| values)
 }
 
 impl Suite<'_> {
     fn settings_are_read(&self) -> Result<Option<String>> {
-        let value = |settings: &toml::Table| self.number((self.plugin.build)(settings)?.as_ref(), &inputs(SIZE, COUNT));
+        let value = |settings: &toml::Table| self.number((self.plugin.build)(settings)?.as_ref(), &self.inputs(SIZE, COUNT));
         settings_are_defaults("loss", &self.plugin.info, self.settings, value)
+    }
+    fn inputs(&self, size: [usize; 2], count: usize) -> Inputs {
+        inputs(size, count, self.attributes)
     }
     fn term(&self) -> Result<Box<dyn LossTerm>> {
         (self.plugin.build)(self.settings)
     }
-    /// The value and its inputs, planes and Gaussians; they track gradients if `track` is set.
-    fn value(&self, term: &dyn LossTerm, inputs: &Inputs, track: bool) -> Result<(Option<Tensor<1>>, Tensor<3>, Gaussians)> {
+    /// The value and its inputs; they track gradients if `track` is set.
+    fn value(&self, term: &dyn LossTerm, inputs: &Inputs, track: bool) -> Result<(Option<Tensor<1>>, Leaves)> {
         let device = self.device.clone().autodiff();
         let [h, w] = inputs.size;
         let leaf = |values: &[f32], shape: [usize; 3]| Tensor::<3>::from_data(TensorData::new(values.to_vec(), shape), &device);
-        let (mut planes, target) = (leaf(&inputs.planes, [5, h, w]), Tensor::<3>::from_inner(leaf(&inputs.target, [3, h, w]).inner()));
-        let mut g = Gaussians::from_host(&inputs.gaussians, &device);
+        let (planes, target) = (leaf(&inputs.planes, [5, h, w]), Tensor::<3>::from_inner(leaf(&inputs.target, [3, h, w]).inner()));
+        let [gaussians, canonical] = [&inputs.gaussians, &inputs.canonical].map(|host| Gaussians::from_host(host, &device));
+        let mut leaves = Leaves { planes, gaussians, canonical };
         if track {
-            planes = planes.require_grad();
-            g.means = g.means.require_grad();
-            g.log_scales = g.log_scales.require_grad();
-            g.quaternions = g.quaternions.require_grad();
-            g.opacity_logits = g.opacity_logits.require_grad();
-            g.sh_dc = g.sh_dc.require_grad();
-            g.sh_rest = g.sh_rest.require_grad();
+            leaves = Leaves { planes: leaves.planes.require_grad(), gaussians: tracked(leaves.gaussians), canonical: tracked(leaves.canonical) };
         }
         let radii = Tensor::<1, Int>::ones([inputs.gaussians.len()], self.device);
-        let schedule = Schedule::main(100);
-        let input = LossInput { planes: &planes, target: &target, gaussians: &g, radii: &radii, time_norm: 0.4, schedule: &schedule };
-        Ok((term.value(&input)?, planes, g))
+        let camera = Camera::look_at("conformance", (w as u32, h as u32), 1.0, [1.0, -2.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let (view, schedule) = (View { camera: 0, frame: 4, time_norm: 0.4, split: Split::Train }, Schedule::main(100));
+        let Leaves { planes, gaussians, canonical } = &leaves;
+        let input = LossInput::new(&camera, &view, planes, &target, gaussians, &radii, &schedule).moved_from(canonical);
+        Ok((term.value(&input)?, leaves))
     }
     fn number(&self, term: &dyn LossTerm, inputs: &Inputs) -> Result<f64> {
         let value = self.value(term, inputs, false)?.0;
         Ok(value.map_or(Ok(vec![0.0]), |v| to_vec(v, "value"))?.first().map_or(f64::NAN, |v| f64::from(*v)))
     }
     fn value_is_a_number(&self) -> Result<Option<String>> {
-        let (term, inputs) = (self.term()?, inputs(SIZE, COUNT));
+        let (term, inputs) = (self.term()?, self.inputs(SIZE, COUNT));
         let Some(value) = self.value(term.as_ref(), &inputs, true)?.0 else { return Ok(Some("it returns no value for an ordinary view".into())) };
         if value.dims() != [1] {
             return Ok(Some(format!("its value has shape {:?}, expected [1]", value.dims())));
@@ -121,23 +204,16 @@ impl Suite<'_> {
         Ok((!first.is_finite() || first != second).then(|| format!("two values of one input are {first} and {second}")))
     }
     fn gradients_are_slopes(&self) -> Result<Option<String>> {
-        let (term, inputs) = (self.term()?, inputs(SIZE, COUNT));
-        let (value, planes, g) = self.value(term.as_ref(), &inputs, true)?;
+        let (term, inputs) = (self.term()?, self.inputs(SIZE, COUNT));
+        let (value, leaves) = self.value(term.as_ref(), &inputs, true)?;
         let Some(value) = value else { return Ok(None) };
-        let gradients = value.backward();
-        let flat = |t: Option<Tensor<2>>| t.map(|t| to_vec(t, "gradient")).transpose();
-        type Slot = fn(&mut Inputs) -> &mut Vec<f32>;
-        let found: [(&str, Option<Vec<f32>>, Slot); 7] = [
-            ("planes", planes.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.planes),
-            ("means", flat(g.means.grad(&gradients))?, |i| &mut i.gaussians.means),
-            ("log_scales", flat(g.log_scales.grad(&gradients))?, |i| &mut i.gaussians.log_scales),
-            ("quaternions", flat(g.quaternions.grad(&gradients))?, |i| &mut i.gaussians.quaternions),
-            ("opacity_logits", g.opacity_logits.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.gaussians.opacity_logits),
-            ("sh_dc", flat(g.sh_dc.grad(&gradients))?, |i| &mut i.gaussians.sh_dc),
-            ("sh_rest", g.sh_rest.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.gaussians.sh_rest),
-        ];
+        let changed = |name: &str, change: &dyn Fn(usize, &mut f32)| {
+            let mut changed = inputs.clone();
+            values_of(&mut changed, name).into_iter().flatten().enumerate().for_each(|(k, value)| change(k, value));
+            changed
+        };
         let mut reached = 0;
-        for (name, gradient, slot) in found {
+        for (name, gradient) in leaves.gradients(&value.backward())? {
             // Terms may leave the graph on purpose, but not for the planes.
             let Some(gradient) = gradient.or_else(|| (name == "planes").then(Vec::new)) else { continue };
             let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
@@ -145,8 +221,7 @@ impl Suite<'_> {
                 return Ok(Some(format!("the gradient of {name} has norm {norm}")));
             }
             if norm == 0.0 {
-                let mut moved = inputs.clone();
-                slot(&mut moved).iter_mut().enumerate().for_each(|(k, v)| *v += MOVE * uniform(Seed::root(57), k));
+                let moved = changed(&name, &|k: usize, value: &mut f32| *value += MOVE * uniform(Seed::root(57), k));
                 let (before, after) = (self.number(term.as_ref(), &inputs)?, self.number(term.as_ref(), &moved)?);
                 if !within(before - after, UNMOVED * before.abs().max(1.0)) {
                     return Ok(Some(format!("no gradient reaches {name}, but a change of it takes the loss from {before:.6e} to {after:.6e}")));
@@ -159,8 +234,7 @@ impl Suite<'_> {
             for step in [3e-3, 1e-2, 3e-2] {
                 let mut ends = [0.0; 2];
                 for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
-                    let mut moved = inputs.clone();
-                    slot(&mut moved).iter_mut().zip(&gradient).for_each(|(v, d)| *v += (sign * step * f64::from(*d) / norm) as f32);
+                    let moved = changed(&name, &|k: usize, value: &mut f32| *value += (sign * step * f64::from(gradient[k]) / norm) as f32);
                     *end = self.number(term.as_ref(), &moved)?;
                 }
                 slopes.push((ends[0] - ends[1]) / (2.0 * step));
@@ -173,7 +247,12 @@ impl Suite<'_> {
     }
     fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
         let term = self.term()?;
-        for (what, inputs) in [("one pixel", inputs([1, 1], COUNT)), ("no Gaussians", inputs(SIZE, 0)), ("one row", inputs([1, 30], 1))] {
+        for (what, inputs) in [
+            ("one pixel", self.inputs([1, 1], COUNT)),
+            ("no Gaussians", self.inputs(SIZE, 0)),
+            ("one row", self.inputs([1, 30], 1)),
+            ("Gaussians without attributes", inputs(SIZE, COUNT, &[])),
+        ] {
             let value = self.number(term.as_ref(), &inputs)?;
             if !value.is_finite() {
                 return Ok(Some(format!("with {what} the value is {value}")));
@@ -181,9 +260,21 @@ impl Suite<'_> {
         }
         Ok(None)
     }
+    fn what_stands_still_has_a_gradient(&self) -> Result<Option<String>> {
+        let (term, inputs) = (self.term()?, self.inputs(SIZE, COUNT));
+        let still = Inputs { canonical: inputs.gaussians.clone(), ..inputs };
+        let (Some(value), leaves) = self.value(term.as_ref(), &still, true)? else { return Ok(None) };
+        let number = to_vec(value.clone(), "value")?.first().copied().unwrap_or(f32::NAN);
+        if !number.is_finite() {
+            return Ok(Some(format!("its value is {number}")));
+        }
+        let broken = |gradient: &Option<Vec<f32>>| gradient.iter().flatten().any(|v| !v.is_finite());
+        let found = leaves.gradients(&value.backward())?;
+        Ok(found.iter().find(|(_, gradient)| broken(gradient)).map(|(name, _)| format!("the gradient of {name} is not finite")))
+    }
     fn fused_is_the_sum(&self) -> Result<Option<String>> {
         let Some(fusion) = &self.plugin.fuses else { return Ok(None) };
-        let inputs = inputs(SIZE, COUNT);
+        let inputs = self.inputs(SIZE, COUNT);
         let weights: Vec<f64> = (0..fusion.kinds.len()).map(|k| 0.3 + 0.9 * k as f64).collect();
         let fused = self.number((fusion.build)(&weights)?.as_ref(), &inputs)?;
         let mut sum = 0.0;
@@ -191,5 +282,97 @@ impl Suite<'_> {
             sum += weight * self.number((self.registry.loss(kind)?.build)(&toml::Table::new())?.as_ref(), &inputs)?;
         }
         Ok((!within(fused - sum, FUSED_TOLERANCE * sum.abs())).then(|| format!("with weights {weights:?} it is {fused}, the sum of its terms is {sum}")))
+    }
+}
+
+#[cfg(test)]
+#[cfg(feature = "cpu")]
+mod tests {
+    use super::*;
+    use crate::{Error, Plugin, ordered_sum};
+
+    /// The mean squared velocity of the Gaussians. With `strict`, Gaussians without velocities are an error; without `learns`, it has no gradient.
+    struct Slow {
+        strict: bool,
+        learns: bool,
+    }
+
+    impl LossTerm for Slow {
+        fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
+            let velocities = match input.gaussians.extra.get("velocity") {
+                Some(velocities) if !input.gaussians.is_empty() => velocities.clone(),
+                None if self.strict => return Err(Error::parameter("loss slow", "there are no velocities", "Choose a deformer that has some")),
+                _ => return Ok(None),
+            };
+            let velocities = if self.learns { velocities } else { velocities.detach() };
+            Ok(Some(ordered_sum(velocities.powi_scalar(2)).div_scalar(3.0 * input.gaussians.len() as f32)))
+        }
+    }
+
+    /// The mean square of how far Gaussians move along the direction in which the camera looks, or with `root` the root of it. The canonical ones get the share
+    /// `share` of their gradient.
+    struct Approach {
+        root: bool,
+        share: f32,
+    }
+
+    impl LossTerm for Approach {
+        fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
+            let (gaussians, canonical, camera) = (input.gaussians, input.canonical.means.clone(), input.camera);
+            if gaussians.is_empty() {
+                return Ok(None);
+            }
+            assert_eq!([camera.height as usize, camera.width as usize], input.planes.dims()[1..]);
+            let canonical = canonical.clone().mul_scalar(self.share) + canonical.detach().mul_scalar(1.0 - self.share);
+            let forward = Tensor::<1>::from_floats(camera.forward_world().map(|x| x as f32), &canonical.device()).unsqueeze_dim::<2>(0);
+            let moved = ((gaussians.means.clone() - canonical) * forward).sum_dim(1);
+            let mean = ordered_sum(moved.powi_scalar(2)).div_scalar(gaussians.len() as f32);
+            Ok(Some(if self.root { mean.sqrt() } else { mean }))
+        }
+    }
+
+    type Build = fn(&toml::Table) -> Result<Box<dyn LossTerm>>;
+
+    fn findings(build: Build, attributes: &[AttributeSpec]) -> Vec<String> {
+        let info = Plugin { name: "a-term", version: "1", summary: "", paper: "", schema: "", capabilities: &[] };
+        let plugin = LossPlugin { info, build, fuses: None };
+        loss_of_attributes(&plugin, &toml::Table::new(), attributes, &Registry::collect().unwrap(), &Device::flex())
+    }
+
+    /// `term`, which has no settings.
+    fn plain(settings: &toml::Table, term: impl LossTerm + 'static) -> Result<Box<dyn LossTerm>> {
+        match settings.keys().next() {
+            None => Ok(Box::new(term)),
+            Some(key) => Err(Error::parameter(format!("loss: {key}"), "there is no such setting", "Remove it")),
+        }
+    }
+
+    #[test]
+    fn a_term_may_compare_with_the_canonical_gaussians_and_know_the_camera() {
+        assert_eq!(findings(|settings| plain(settings, Approach { root: false, share: 1.0 }), &[]), [""; 0]);
+        let mistakes: [(Build, &str); 3] = [
+            (|settings| plain(settings, Approach { root: true, share: 1.0 }), "standing still: the gradient of means is not finite"),
+            (|settings| plain(settings, Approach { root: false, share: 0.5 }), "gradients: canonical means: the loss rises"),
+            (|settings| plain(settings, Approach { root: false, share: 0.0 }), "gradients: no gradient reaches canonical means"),
+        ];
+        for (build, finding) in mistakes {
+            let found = findings(build, &[]);
+            assert!(found.iter().any(|line| line.contains(finding)), "{finding}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn a_term_may_read_attributes_of_a_deformer() {
+        let velocity = [AttributeSpec::new("velocity", 3, 0.0, 1e-3)];
+        assert_eq!(findings(|settings| plain(settings, Slow { strict: false, learns: true }), &velocity), [""; 0]);
+        let mistakes: [(Build, &[AttributeSpec], &str); 3] = [
+            (|settings| plain(settings, Slow { strict: false, learns: true }), &[], "it returns no value for an ordinary view"),
+            (|settings| plain(settings, Slow { strict: true, learns: true }), &velocity, "there are no velocities"),
+            (|settings| plain(settings, Slow { strict: false, learns: false }), &velocity, "gradients"),
+        ];
+        for (build, attributes, finding) in mistakes {
+            let found = findings(build, attributes);
+            assert!(found.iter().any(|line| line.contains(finding)), "{finding}: {found:?}");
+        }
     }
 }

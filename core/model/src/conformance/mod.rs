@@ -18,7 +18,7 @@ pub use cc4dgs_format::conformance::exporter;
 pub use cc4dgs_format::conformance::{codec, weight_codec};
 pub use deformer::deformer;
 pub use density::density;
-pub use loss::loss;
+pub use loss::{loss, loss_of_attributes};
 pub use optimizer::optimizer;
 pub use preset::preset;
 pub use rasterizer::rasterizer;

@@ -97,7 +97,7 @@ fn read(section: &toml::Table) -> Result<Listed> {
 mod tests {
     use super::*;
     use burn::tensor::{Device, Int};
-    use cc4dgs_core::{Gaussians, HostGaussians, Schedule};
+    use cc4dgs_core::{Camera, Gaussians, HostGaussians, Schedule, Split, View};
 
     /// As many ones.
     struct Ones(usize);
@@ -114,7 +114,9 @@ mod tests {
         let (planes, target) = (Tensor::<3>::zeros([5, 2, 2], &device), Tensor::<3>::zeros([3, 2, 2], &device));
         let none = HostGaussians { sh_degree: 1, ..Default::default() };
         let (gaussians, radii) = (Gaussians::from_host(&none, &device), Tensor::<1, Int>::zeros([1], &device));
-        let input = LossInput { planes: &planes, target: &target, gaussians: &gaussians, radii: &radii, time_norm: 0.5, schedule: &Schedule::main(1) };
+        let camera = Camera::look_at("a camera", (2, 2), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let (view, schedule) = (View { camera: 0, frame: 0, time_norm: 0.5, split: Split::Train }, Schedule::main(1));
+        let input = LossInput::new(&camera, &view, &planes, &target, &gaussians, &radii, &schedule);
         let of = |numbers: usize| LossTerms(vec![Term { name: "mine".into(), weight: 0.5, term: Box::new(Ones(numbers)) }]).value(&input);
         assert_eq!(of(1).unwrap().into_scalar::<f32>(), 0.5);
         let message = of(4).unwrap_err().to_string();

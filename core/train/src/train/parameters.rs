@@ -3,12 +3,18 @@
 use super::rounded::{ExactWeights, WeightScale};
 use crate::gaussian_set::log_linear;
 use burn::tensor::{Gradients, Tensor};
-use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings, ordered_sum};
+use cc4dgs_core::{AttributeSpec, Optimizer, Parameter, ParameterGroup, Result, StepSettings, ordered_sum};
 
 /// The learning rate of `group` at `progress` in 0..1 of the stage; `extent` is that of the cameras in the normalised frame.
 pub(crate) fn rate(group: &ParameterGroup, progress: f64, extent: f64) -> f64 {
     let warm = if group.warmup > 0.0 { (progress / group.warmup).min(1.0) } else { 1.0 };
     log_linear(group.lr_start, group.lr_end, progress) * warm * if group.times_extent { extent } else { 1.0 }
+}
+
+/// The learning rate of an `attribute` of a deformer, as [`rate`].
+pub(crate) fn attribute_rate(attribute: &AttributeSpec, progress: f64, extent: f64) -> f64 {
+    let AttributeSpec { lr, lr_end, times_extent, .. } = *attribute;
+    lr_end.map_or(lr, |lr_end| log_linear(lr, lr_end, progress)) * if times_extent { extent } else { 1.0 }
 }
 
 /// Makes the weights leaves of the coming step; [`update`] undoes it.
@@ -66,4 +72,22 @@ pub(crate) fn update(
         parameter.value = optimizer.step(&name, value.reshape([count, 1]), gradient.reshape([count, 1]), &settings)?.reshape([count]);
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_of_attributes_fall_as_those_of_weights_or_not_at_all() {
+        let constant = AttributeSpec { times_extent: true, ..AttributeSpec::new("velocity", 3, 0.0, 1.6e-3) };
+        let falling = AttributeSpec { lr_end: Some(1.6e-5), ..constant.clone() };
+        let group = ParameterGroup { times_extent: true, ..ParameterGroup::plain("velocity", 1.6e-3, 1.6e-5) };
+        for progress in [0.0, 1e-4, 0.3, 0.5, 1.0] {
+            assert_eq!(attribute_rate(&constant, progress, 2.5), 1.6e-3 * 2.5);
+            assert_eq!(attribute_rate(&falling, progress, 2.5), rate(&group, progress, 2.5));
+        }
+        assert!((attribute_rate(&falling, 0.5, 1.0) - 1.6e-4).abs() < 1e-12 && (attribute_rate(&falling, 1.0, 2.0) - 3.2e-5).abs() < 1e-12);
+        assert_eq!(attribute_rate(&AttributeSpec { times_extent: false, ..constant }, 0.5, 2.5), 1.6e-3);
+    }
 }

@@ -29,15 +29,8 @@ impl Context<'_> {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let wanted: Vec<f32> = mask.mask.iter().map(|&moves| f32::from(u8::from(moves))).collect();
         let target = Tensor::<3>::from_inner(Tensor::from_data(TensorData::new(wanted, [1, h, w]), &self.device));
-        let time_norm = self.job.scene.views[mask.view].time_norm;
-        let loss = self.score_loss.value(&LossInput {
-            planes: &output.planes,
-            target: &target,
-            gaussians: &gaussians,
-            radii: &output.stats.radii,
-            time_norm,
-            schedule,
-        })?;
+        let (view, radii) = (&self.job.scene.views[mask.view], &output.stats.radii);
+        let loss = self.score_loss.value(&LossInput::new(camera, view, &output.planes, &target, &gaussians, radii, schedule))?;
         if log.due(iteration) || check {
             let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);
             if !value.is_finite() {

@@ -110,7 +110,7 @@ impl Context<'_> {
         }
         let mut offsets = offsets.into_iter();
         for &view in batch {
-            let (camera, time_norm) = (scene.camera(view), scene.views[view].time_norm);
+            let camera = scene.camera(view);
             let drawn = match (offsets.next(), &state.deformer) {
                 (Some(offsets), Some(deformer)) => {
                     offsets.check(deformer.name(), rows.count())?;
@@ -146,7 +146,7 @@ impl Context<'_> {
             let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
             let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
             let radii = output.stats.radii;
-            let input = LossInput { planes: &planes, target: &target, gaussians: &drawn, radii: &radii, time_norm, schedule };
+            let input = LossInput::new(camera, &scene.views[view], &planes, &target, &drawn, &radii, schedule).moved_from(&gaussians);
             let loss = self.losses.value(&input)?;
             if (read || check) && !is_finite(&loss, "loss")? {
                 let part = if is_finite(&planes, "image")? { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
@@ -224,7 +224,7 @@ impl Context<'_> {
         }
         let extent = f64::from(schedule.extent);
         let of_plugin: BTreeMap<String, f64> =
-            state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
+            state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name.clone(), parameters::attribute_rate(&a, progress, extent))).collect();
         let scale = train.rate_scale(schedule, batch.len());
         let rates = state.rates.clone();
         let rate = |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, schedule));

@@ -1,14 +1,15 @@
 //! `faint`: the mean opacity as a loss term, so that Gaussians that are not needed fade away (3DGS-MCMC).
 
 use cc4dgs_core::burn::tensor::{Tensor, activation::sigmoid};
-use cc4dgs_core::{Error, LossInput, LossPlugin, LossTerm, Plugin, Result, inventory, toml};
+use cc4dgs_core::{Error, LossInput, LossPlugin, LossTerm, Plugin, Result, inventory, ordered_sum, toml};
 
 struct Faint;
 
 impl LossTerm for Faint {
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
-        let logits = &input.gaussians.opacity_logits;
-        Ok((logits.dims()[0] > 0).then(|| sigmoid(logits.clone()).mean()))
+        let (logits, count) = (&input.gaussians.opacity_logits, input.gaussians.len());
+        // burn's own sums and means may add in another order in every run.
+        Ok((count > 0).then(|| ordered_sum(sigmoid(logits.clone())).div_scalar(count as f32)))
     }
 }
 

@@ -97,9 +97,18 @@ fn shared(opacity: f32, copies: u32) -> (f32, f32) {
 
 fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     let control: Relocate = config::parse_section("density relocate", section)?;
-    let sound =
-        control.every > 0 && (0.0..1.0).contains(&control.dead_below) && (0.0..=1.0).contains(&control.growth) && (0.0..=100.0).contains(&control.noise);
-    if sound { Ok(Box::new(control)) } else { Err(Error::parameter("density relocate", "a setting is out of range", "See `plugins relocate`")) }
+    for (name, value, least, most) in [
+        ("every", control.every as f64, 1.0, 1e6),
+        ("dead_below", f64::from(control.dead_below), 0.0, 0.99),
+        ("growth", control.growth, 0.0, 1.0),
+        ("noise", f64::from(control.noise), 0.0, 100.0),
+    ] {
+        if !(least..=most).contains(&value) {
+            let problem = format!("{value} is not from {least} to {most}");
+            return Err(Error::parameter(format!("density relocate: {name}"), problem, "Give a number in this range, or leave it out"));
+        }
+    }
+    Ok(Box::new(control))
 }
 
 inventory::submit! {

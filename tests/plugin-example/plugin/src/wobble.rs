@@ -4,7 +4,7 @@ use cc4dgs_core::burn::tensor::{Device, Tensor};
 use cc4dgs_core::serde::{self, Deserialize};
 use cc4dgs_core::{
     AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
-    SpatialInput, config, inventory, toml,
+    SpatialInput, config, inventory, ordered_sum, toml,
 };
 use std::f32::consts::TAU;
 
@@ -59,14 +59,17 @@ impl Deformer for Wobble {
     }
     fn regularizer(&self, input: &SpatialInput, _: f32, _: f32) -> Result<Option<Tensor<1>>> {
         // What need not swing should not.
-        Ok((!input.is_empty()).then(|| input.attributes[0].clone().powi_scalar(2).mean().mul_scalar(1e-3)))
+        let squares = || input.attributes[0].clone().powi_scalar(2);
+        Ok((!input.is_empty()).then(|| ordered_sum(squares()).mul_scalar(1e-3 / (3 * input.len()) as f32)))
     }
 }
 
 fn build(section: &toml::Table, _: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     let settings: Settings = config::parse_section("deformer wobble", section)?;
-    if !(settings.cycles.is_finite() && settings.lr.is_finite()) {
-        return Err(Error::parameter("deformer wobble", "a setting is not finite", "Give numbers"));
+    for (name, value) in [("cycles", f64::from(settings.cycles)), ("lr", settings.lr)] {
+        if !value.is_finite() {
+            return Err(Error::parameter(format!("deformer wobble: {name}"), format!("{value} is not finite"), "Give a number such as the default"));
+        }
     }
     let wind = Parameter { name: "wind".into(), part: Part::Net, shape: vec![3], value: Tensor::zeros([3], device), group: 0 };
     Ok(Box::new(Wobble { settings, parameters: vec![wind] }))

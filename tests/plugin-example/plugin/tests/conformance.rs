@@ -35,9 +35,11 @@ fn the_density_control_conforms() {
 }
 
 #[test]
-fn the_loss_conforms() {
+fn the_losses_conform() {
     let registry = Registry::collect().unwrap();
-    assert_eq!(findings(|device| conformance::loss(registry.loss("faint").unwrap(), &Table::new(), &registry, device)), "");
+    for name in ["charbonnier", "faint", "keep-size"] {
+        assert_eq!(findings(|device| conformance::loss(registry.loss(name).unwrap(), &Table::new(), &registry, device)), "");
+    }
 }
 
 #[test]

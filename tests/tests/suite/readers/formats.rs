@@ -173,8 +173,9 @@ fn llff_with_videos() {
         path.to_string_lossy().into_owned()
     };
     let packets: Vec<String> = (0..6).map(|t| format!("{{\"pts_time\": \"{}.0\", \"flags\": \"K_\"}}", t)).collect();
-    let facts = format!("{{\"packets\": [{}], \"streams\": [{{\"width\": 16, \"height\": 12}}]}}", packets.join(","));
-    script("ffprobe", format!("#!/bin/sh\necho '{facts}'\n"));
+    let facts = format!("{{\"packets\": [{}], \"streams\": [{{\"width\": 16, \"height\": 12, \"field_order\": \"ORDER\"}}]}}", packets.join(","));
+    // The second camera is interlaced.
+    script("ffprobe", format!("#!/bin/sh\ncase \"$*\" in *cam01*) order=tt;; *) order=progressive;; esac\necho '{facts}' | sed \"s/ORDER/$order/\"\n"));
     // The last argument is the pattern; the frames the filter selects are 1, 3, 5.
     let log = tools.path().join("log");
     let body = "for last; do :; done\nout=$(dirname \"$last\")\ncam=$(echo \"$*\" | grep -o 'cam0[0-9]' | head -1)\n";
@@ -183,6 +184,9 @@ fn llff_with_videos() {
     let options = SceneOptions { ffmpeg, frames: Some([1, 3, 2]), video_cache: Some(tools.path().join("cache")), ..Default::default() };
     let scene = open(dir.path(), &options, &Limits::default()).unwrap();
     assert_eq!(scene.frame_count, 3);
+    let combed: Vec<&String> = scene.warnings.iter().filter(|w| w.contains("interlaced")).collect();
+    let parts = ["1 of 2 videos", "(cam01.mp4)", "ffmpeg -i cam01.mp4 -vf yadif", "OTHER_FOLDER/cam01.mp4"];
+    assert!(combed.len() == 1 && parts.iter().all(|part| combed[0].contains(part)), "{:?}", scene.warnings);
     assert!(!log.exists(), "nothing is decoded before a frame is wanted");
     for (view, v) in scene.views.iter().enumerate() {
         assert_eq!(scene.frame(view).unwrap().data[2] as usize, 10 * v.camera + 1 + 2 * v.frame);
