@@ -8,6 +8,10 @@ const ELEVATION: f64 = 0.35;
 pub(crate) const FOV_X: f64 = 0.9;
 /// Gaussians fainter than this are haze and say nothing of where the model is.
 const FAINT_LOGIT: f32 = -2.0;
+/// The share of the Gaussians that lie within the radius of a model.
+const SHARE: f64 = 0.7;
+/// Standard deviations from the centre of a Gaussian to where it is hardly seen.
+const EXTENT: f64 = 3.0;
 
 /// A circle of cameras that look at the middle of a model.
 #[derive(Clone, Debug, PartialEq)]
@@ -87,20 +91,25 @@ pub(crate) fn checked(cameras: Vec<Camera>, middle: [f64; 3], distance: f64) -> 
     Ok(cameras)
 }
 
-/// The median of the centres and the distance within which 70 % of them lie: a background far away must not push the camera out.
+/// The median of the centres and the distance within which [`SHARE`] of them lie: a background far away must not push the camera out. If the Gaussians themselves
+/// are larger than that, such as a single one, it is their size instead. 1 for models without either.
 pub(crate) fn middle_and_radius(gaussians: &HostGaussians) -> ([f64; 3], f64) {
-    let centre = |i: usize| -> [f64; 3] { std::array::from_fn(|k| f64::from(gaussians.means[3 * i + k])) };
-    let mut kept: Vec<[f64; 3]> = (0..gaussians.len()).filter(|&i| gaussians.opacity_logits[i] > FAINT_LOGIT).map(centre).collect();
+    let mut kept: Vec<usize> = (0..gaussians.len()).filter(|&i| gaussians.opacity_logits[i] > FAINT_LOGIT).collect();
     if kept.is_empty() {
-        kept = (0..gaussians.len()).map(centre).collect();
+        kept = (0..gaussians.len()).collect();
     }
+    let centres: Vec<[f64; 3]> = kept.iter().map(|&i| std::array::from_fn(|k| f64::from(gaussians.means[3 * i + k]))).collect();
+    let size = |&i: &usize| {
+        let own = gaussians.log_scales.get(3 * i..3 * i + 3)?;
+        Some(EXTENT * own.iter().map(|v| f64::from(*v).exp()).fold(0.0, f64::max)).filter(|size| size.is_finite())
+    };
     let quantile = |mut values: Vec<f64>, q: f64| {
         values.sort_unstable_by(f64::total_cmp);
         values.get((q * values.len() as f64) as usize).copied().unwrap_or(0.0)
     };
-    let middle: [f64; 3] = std::array::from_fn(|k| quantile(kept.iter().map(|p| p[k]).collect(), 0.5));
+    let middle: [f64; 3] = std::array::from_fn(|k| quantile(centres.iter().map(|p| p[k]).collect(), 0.5));
     let distance = |p: &[f64; 3]| (0..3).map(|k| (p[k] - middle[k]).powi(2)).sum::<f64>().sqrt();
-    let radius = quantile(kept.iter().map(distance).collect(), 0.7);
+    let radius = quantile(centres.iter().map(distance).collect(), SHARE).max(quantile(kept.iter().filter_map(size).collect(), SHARE));
     (middle, if radius > 0.0 { radius } else { 1.0 })
 }
 
@@ -125,6 +134,26 @@ mod tests {
             }
             assert_ne!(cameras[0], cameras[6]);
         }
+    }
+
+    #[test]
+    fn a_single_gaussian_is_seen_from_outside_whatever_its_size() {
+        let small = Orbit { size: (80, 60), frames: 1, ..Orbit::default() };
+        let distance = |count: usize, size: f64| {
+            let log_scales = [size.ln() as f32, -60.0, -70.0].repeat(count);
+            let model = HostGaussians { means: vec![3.0; 3 * count], log_scales, opacity_logits: vec![2.0; count], ..Default::default() };
+            let eye = small.around(&model).unwrap()[0].center_world();
+            eye.iter().map(|v| (v - 3.0).powi(2)).sum::<f64>().sqrt()
+        };
+        // All at one place have no distance from each other either.
+        for (count, size) in [(1, 1e-5), (1, 1.0), (1, 1e5), (4, 1e-5), (4, 1e5)] {
+            let ratio = distance(count, size) / size;
+            assert!((5.0..20.0).contains(&ratio), "{count} of size {size}: seen from {ratio} times as far");
+        }
+        let tiny = HostGaussians { log_scales: vec![-20.0; 24], ..cube(5.0) };
+        assert_eq!(small.around(&tiny).unwrap(), small.around(&cube(5.0)).unwrap(), "sizes below the distances change nothing");
+        let broken = HostGaussians { means: vec![3.0; 3], log_scales: vec![f32::INFINITY; 3], opacity_logits: vec![2.0], ..Default::default() };
+        assert_eq!(middle_and_radius(&broken).1, 1.0);
     }
 
     #[test]

@@ -70,7 +70,7 @@ methods! {
 #[cfg(test)]
 mod tests {
     use crate::config::RunConfig;
-    use cc4dgs_core::{PresetRole, Registry};
+    use cc4dgs_core::{PresetRole, Registry, Schedule};
 
     #[test]
     fn every_family_and_method_resolves() {
@@ -91,5 +91,15 @@ mod tests {
         assert!(RunConfig::resolve(Some("n3dv+hexplan"), None, &[]).unwrap_err().to_string().contains("hexplane"));
         let method_alone = RunConfig::resolve(Some("hexplane"), None, &[]).unwrap_err().to_string();
         assert!(method_alone.contains("demo+hexplane"), "{method_alone}");
+    }
+
+    #[test]
+    fn embedding_grows_from_its_published_iterations_on() {
+        for (name, first) in [("n3dv+embedding", 5000), ("technicolor+embedding", 500)] {
+            let config = RunConfig::resolve(Some(name), None, &[]).unwrap();
+            assert_eq!(config.train.shares, [0.0, 0.0, 1.0]);
+            let from = config.density["from"].as_integer().unwrap();
+            assert_eq!(Schedule::main(config.train.iterations).at(from as usize), first, "{name}");
+        }
     }
 }

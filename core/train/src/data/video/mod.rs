@@ -56,10 +56,25 @@ pub(super) fn footage(videos: &[PathBuf], options: &SceneOptions, limits: &Limit
     let times: Vec<&[f64]> = facts.iter().map(|f| f.times.as_slice()).collect();
     let common = timeline(&names, &times);
     warnings.extend(common.notes);
+    warnings.extend(of_two_moments(&names, &facts));
     let sources = |(video, frames): (&PathBuf, Vec<Option<usize>>)| -> Vec<Option<ImageSource>> {
         frames.into_iter().map(|frame| frame.map(|frame| ImageSource::Video { path: video.clone(), frame })).collect()
     };
     Ok(facts.iter().zip(videos.iter().zip(common.frames)).map(|(f, found)| Footage { size: f.size, images: sources(found) }).collect())
+}
+
+/// A warning of the videos whose frames show two moments each, and what helps; `None` where there are none.
+fn of_two_moments(names: &[String], facts: &[VideoFacts]) -> Option<String> {
+    let interlaced: Vec<&str> = names.iter().zip(facts).filter(|(_, facts)| facts.interlaced).map(|(name, _)| name.as_str()).collect();
+    let first = interlaced.first()?;
+    let stem = Path::new(first).file_stem().unwrap_or_default().to_string_lossy();
+    Some(format!(
+        "interlaced frames in {} of {} videos ({first}{}): the odd and the even rows of a frame show different moments, so what moves has combed edges. \
+         Deinterlace each (ffmpeg -i {first} -vf yadif -c:v libx264 -crf 12 OTHER_FOLDER/{stem}.mp4) and put the new files in their place",
+        interlaced.len(),
+        names.len(),
+        if interlaced.len() > 1 { " and others" } else { "" }
+    ))
 }
 
 /// A path as an input of ffmpeg: never an address or an option, whatever its name.

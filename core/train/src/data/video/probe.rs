@@ -28,6 +28,8 @@ pub(crate) struct VideoFacts {
     pub times: Vec<f64>,
     /// Whether each frame is a key frame.
     pub keys: Vec<bool>,
+    /// Whether each frame holds two fields of different moments, every second row of one.
+    pub interlaced: bool,
 }
 
 /// One of the eight orientations of an image.
@@ -69,6 +71,7 @@ struct Stream {
     height: u64,
     r_frame_rate: Option<String>,
     avg_frame_rate: Option<String>,
+    field_order: Option<String>,
     #[serde(default)]
     side_data_list: Vec<SideData>,
 }
@@ -100,7 +103,7 @@ pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Re
 }
 
 fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFacts> {
-    let entries = "packet=pts_time,flags:stream=width,height,r_frame_rate,avg_frame_rate:stream_side_data=displaymatrix,rotation";
+    let entries = "packet=pts_time,flags:stream=width,height,r_frame_rate,avg_frame_rate,field_order:stream_side_data=displaymatrix,rotation";
     let printed = ask(video, options, &["-show_entries", entries])?;
     let bad = |problem: String, remedy: &str| Error::data(format!("video {}", video.display()), problem, remedy);
     let Some(stream) = printed.streams.first() else { return Err(bad("it holds no video".into(), "Check the file")) };
@@ -115,7 +118,7 @@ fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFa
     if times.is_empty() {
         return Err(bad("it has no frame".into(), "Check the video"));
     }
-    Ok(VideoFacts { size: if turn.swaps { [size[1], size[0]] } else { size }, times, keys })
+    Ok(VideoFacts { size: if turn.swaps { [size[1], size[0]] } else { size }, times, keys, interlaced: stream.is_interlaced() })
 }
 
 /// How the frames of a video are turned, without listing its packets.
@@ -200,6 +203,10 @@ impl Stream {
         };
         parse(&self.avg_frame_rate).or_else(|| parse(&self.r_frame_rate)).unwrap_or(DEFAULT_RATE)
     }
+    /// Whether its frames consist of two fields, whichever is first in the file or shown first.
+    fn is_interlaced(&self) -> bool {
+        matches!(self.field_order.as_deref(), Some("tt" | "bb" | "tb" | "bt"))
+    }
 }
 
 /// The upper left 2x2 numbers of a display matrix, which ffprobe prints as three numbered lines of three integers.
@@ -268,6 +275,13 @@ mod tests {
         assert_eq!(stream("{\"rotation\": -90}").unwrap().filter, "transpose=clock");
         assert!(stream("{\"rotation\": 30}").is_err());
         assert_eq!(stream("{}"), Ok(Turn::UPRIGHT));
+    }
+
+    #[test]
+    fn only_frames_of_two_fields_are_interlaced() {
+        let stream = |order: &str| serde_json::from_str::<Stream>(&format!("{{\"field_order\": \"{order}\"}}")).unwrap().is_interlaced();
+        assert!(["tt", "bb", "tb", "bt"].into_iter().all(stream));
+        assert!(!stream("progressive") && !stream("unknown") && !serde_json::from_str::<Stream>("{}").unwrap().is_interlaced());
     }
 
     #[test]
