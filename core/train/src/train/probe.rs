@@ -3,7 +3,7 @@
 use super::{Context, TrainState};
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Gaussians, Result, SpatialInput, Splats, ordered_sum};
+use cc4dgs_core::{Gaussians, Result, Scene, SpatialInput, Splats, ordered_sum};
 
 /// Mean of all `values`, the same bits whatever the number of threads; `object` names it in errors.
 pub(super) fn mean<const D: usize>(values: Tensor<D>, object: &str) -> Result<f32> {
@@ -28,6 +28,18 @@ impl Context<'_> {
         gaussians: &Gaussians,
         requests: &[(usize, f32)],
         sh_degree: usize,
+        each: impl FnMut(usize, Tensor<3>) -> Result<()>,
+    ) -> Result<()> {
+        self.draw_at_size_of(&self.job.scene, state, gaussians, requests, sh_degree, each)
+    }
+    /// As [`Context::draw`], with images of the size that those of `scene` have, which has the views of the run.
+    fn draw_at_size_of(
+        &self,
+        scene: &Scene,
+        state: &mut TrainState,
+        gaussians: &Gaussians,
+        requests: &[(usize, f32)],
+        sh_degree: usize,
         mut each: impl FnMut(usize, Tensor<3>) -> Result<()>,
     ) -> Result<()> {
         let rows = state.moving_rows(&self.device)?;
@@ -47,27 +59,23 @@ impl Context<'_> {
                 (Some(features), Some(deformer)) => deformer.field.deform(features.clone(), time_norm)?.apply(deformer.name(), gaussians, rows.indices())?,
                 _ => gaussians.clone(),
             };
-            let output = self.rasterizer.render(&Splats::from_gaussians(&drawn, sh_degree), self.job.scene.camera(view), &settings)?;
-            let camera = self.training_camera.get(&self.job.scene.views[view].camera).copied();
+            let output = self.rasterizer.render(&Splats::from_gaussians(&drawn, sh_degree), scene.camera(view), &settings)?;
+            let camera = self.training_camera.get(&scene.views[view].camera).copied();
             each(index, state.appearance.apply(output.planes, camera)?.narrow(0, 0, 3))?;
         }
         Ok(())
     }
-    /// PSNR in dB of each of `views`, images not rounded. `gaussians` have the rows of `state`.
-    pub(crate) fn psnr_of_views(&self, state: &mut TrainState, gaussians: &Gaussians, views: &[usize], sh_degree: usize) -> Result<Vec<f32>> {
+    /// Mean PSNR in dB of `gaussians`, which have the rows of `state`, on `views` of `scene`: the scene of the run, or the same views with images of another size.
+    /// Images are not rounded.
+    pub(crate) fn mean_psnr(&self, scene: &Scene, state: &mut TrainState, gaussians: &Gaussians, views: &[usize], sh_degree: usize) -> Result<f32> {
         let rgb = self.job.config.background()?;
-        let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, self.job.scene.views[view].time_norm)).collect();
-        let mut scores = Vec::with_capacity(views.len());
-        self.draw(state, gaussians, &requests, sh_degree, |index, image| {
-            let target = self.rasterizer.upload(&self.job.scene.frame(views[index])?, rgb, &self.device);
+        let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
+        let mut scores: Vec<f32> = Vec::with_capacity(views.len());
+        self.draw_at_size_of(scene, state, gaussians, &requests, sh_degree, |index, image| {
+            let target = self.rasterizer.upload(&scene.frame(views[index])?, rgb, &self.device);
             scores.push(psnr_db(image, target)?);
             Ok(())
         })?;
-        Ok(scores)
-    }
-    /// Mean PSNR in dB of `gaussians` on `views`.
-    pub(crate) fn mean_psnr(&self, state: &mut TrainState, gaussians: &Gaussians, views: &[usize], sh_degree: usize) -> Result<f32> {
-        let scores = self.psnr_of_views(state, gaussians, views, sh_degree)?;
         Ok(scores.iter().sum::<f32>() / scores.len().max(1) as f32)
     }
 }

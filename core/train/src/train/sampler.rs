@@ -35,15 +35,20 @@ impl Sampler {
         }
         self
     }
+    /// The views that iteration `index`, from 0, may draw: one at least, where there are any.
+    pub fn open(&self, index: usize) -> &[usize] {
+        let open = self.opens.partition_point(|&from| from <= index);
+        &self.views[..open.max(usize::from(!self.views.is_empty()))]
+    }
     /// The views of iteration `index`, from 0.
     pub fn batch(&mut self, index: usize) -> Vec<usize> {
         let n = self.views.len();
         let size = self.batch.min(n);
-        let open = self.opens.partition_point(|&from| from <= index);
-        if open < n {
+        let open = self.open(index);
+        if open.len() < n {
             // The set grows from draw to draw, so there are no epochs yet.
             let mut rng = self.seed.child("ramp").index(index as u64).rng();
-            return rand::seq::index::sample(&mut rng, open.max(1), size.min(open.max(1))).into_iter().map(|i| self.views[i]).collect();
+            return rand::seq::index::sample(&mut rng, open.len(), size.min(open.len())).into_iter().map(|i| open[i]).collect();
         }
         (0..size)
             .map(|b| {
@@ -118,10 +123,12 @@ mod tests {
         for index in 0..300 {
             let view = sampler.batch(index)[0];
             assert!(view / 3 <= index / 100, "view {view} at iteration {index}");
+            assert_eq!(sampler.open(index).len(), 3 * (index / 100 + 1), "iteration {index}");
         }
         let mut epoch: Vec<usize> = (300..312).map(|i| sampler.batch(i)[0]).collect();
         epoch.sort_unstable();
         assert_eq!(epoch, (0..12).collect::<Vec<_>>());
+        assert_eq!(Sampler::new((3..6).collect(), Seed::root(1), 1).open(0), [3, 4, 5], "without a ramp");
         let early = Sampler::new((0..12).collect(), Seed::root(1), 5).with_ramp(|share| 300.0 * share, time).batch(0);
         assert_eq!(early.len(), 3, "no more views than are open");
     }

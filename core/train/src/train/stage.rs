@@ -124,7 +124,7 @@ impl Context<'_> {
     }
 
     /// Which views the iterations of the stage of `schedule` see.
-    fn sampler(&self, schedule: &Schedule) -> Sampler {
+    pub(super) fn sampler(&self, schedule: &Schedule) -> Sampler {
         let (train, stage) = (&self.job.config.train, schedule.stage);
         let sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), train.views_per_iteration(stage));
         // Only a canonical space that is the first frame can be left frame by frame.

@@ -28,7 +28,7 @@ impl Context<'_> {
             return Ok(());
         }
         let gaussians = state.set.gaussians()?;
-        let psnr_db = self.mean_psnr(state, &gaussians, &views, schedule.sh_degree)?;
+        let psnr_db = self.mean_psnr(scene, state, &gaussians, &views, schedule.sh_degree)?;
         self.job.events.emit(&Event::Validated {
             stage: schedule.stage.name().into(),
             iteration: schedule.iteration,

@@ -1,12 +1,15 @@
 //! Judges plans by what they cost on training views.
 
 use super::super::density::moving_first;
+use super::super::pyramid::Pyramid;
+use super::super::sampler::Sampler;
 use super::super::{Context, TrainState};
 use super::{MAX_COST_DB, Removal, Reset, Standing, recovery};
 use crate::sample::spread_views;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DensityPlan, Event, Result, Schedule};
+use cc4dgs_core::{DensityPlan, Event, Gaussians, Result, Scene, Schedule};
+use std::sync::Arc;
 
 /// Training views that are rendered to find out.
 const PROBES: usize = 3;
@@ -18,6 +21,26 @@ const FAINT: f32 = 0.02;
 const INVISIBLE_LOGIT: f32 = -30.0;
 /// The attribute that a reset sets.
 pub(super) const OPACITIES: &str = "opacity_logits";
+
+/// The images that say what a removal costs: of the size and of the frames that training sees at the time.
+struct Probes {
+    scene: Arc<Scene>,
+    views: Vec<usize>,
+}
+
+impl Probes {
+    /// Those of the iteration of `schedule`, whose views are drawn by `sampler` from a scene of `pyramid`.
+    fn new(pyramid: &Pyramid, sampler: &Sampler, schedule: &Schedule) -> Self {
+        let scene = pyramid.at(schedule.image_scale).clone();
+        let mut open = sampler.open(schedule.iteration.saturating_sub(1)).to_vec();
+        open.sort_unstable();
+        Self { views: spread_views(&scene, &open, PROBES), scene }
+    }
+    /// Whether scores on these can be compared with scores on `other`.
+    fn same_as(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.scene, &other.scene) && self.views == other.views
+    }
+}
 
 impl Context<'_> {
     /// Weakens what `plan` removes, remembers what it resets, and puts what moves first. Call before the plan is carried out.
@@ -49,6 +72,11 @@ impl Context<'_> {
     fn kept_after_all(&self, removed: &[usize], logits: &[f32], state: &mut TrainState, schedule: &Schedule) -> Result<(Vec<usize>, bool)> {
         let broken = broken_rows(state)?;
         let (mut kept, mut going) = state.guard.divide(removed, logits, |row| broken[row], schedule);
+        let probes = self.probes(schedule);
+        // A score on smaller images, or on fewer frames, does not tell what has been lost since.
+        if state.guard.removal.as_ref().is_some_and(|last| !self.probes(&self.lengths.schedule(schedule.stage, last.iteration)).same_as(&probes)) {
+            state.guard.removal = None;
+        }
         let faint = (FAINT / (1.0 - FAINT)).ln();
         let harmless = (going.len() as f64) < PROBED_SHARE * logits.len() as f64 && going.iter().all(|&row| logits[row] < faint);
         // Nothing whose cost has to be measured.
@@ -57,9 +85,9 @@ impl Context<'_> {
             kept.sort_unstable();
             return Ok((kept, false));
         }
-        let probes = self.probes(schedule);
+        let Probes { scene, views } = probes;
         let gaussians = state.set.gaussians()?;
-        let psnr_db = self.mean_psnr(state, &gaussians, &probes, schedule.sh_degree)?;
+        let psnr_db = self.mean_psnr(&scene, state, &gaussians, &views, schedule.sh_degree)?;
         let standing = state.guard.standing(psnr_db, schedule);
         state.guard.release(&standing, schedule);
         let mut measured = false;
@@ -72,7 +100,7 @@ impl Context<'_> {
                     going.iter().for_each(|&row| without[row] = INVISIBLE_LOGIT);
                     let mut gaussians = gaussians.clone();
                     gaussians.opacity_logits = Tensor::from_data(TensorData::new(without, [logits.len()]), &self.device);
-                    let cost = from.psnr_db - self.mean_psnr(state, &gaussians, &probes, schedule.sh_degree)?;
+                    let cost = from.psnr_db - self.mean_psnr(&scene, state, &gaussians, &views, schedule.sh_degree)?;
                     if cost <= MAX_COST_DB {
                         break;
                     }
@@ -108,7 +136,7 @@ impl Context<'_> {
             return Ok(false);
         }
         let gaussians = state.set.gaussians()?;
-        let psnr_db = self.mean_psnr(state, &gaussians, &self.probes(schedule), schedule.sh_degree)?;
+        let psnr_db = self.psnr_of_stage(state, &gaussians, schedule)?;
         if !psnr_db.is_finite() || state.guard.reset.as_ref().is_some_and(|last| psnr_db < last.psnr_db - MAX_COST_DB) {
             return Ok(false);
         }
@@ -133,7 +161,7 @@ impl Context<'_> {
     fn judge_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let Some(reset) = state.guard.reset.take() else { return Ok(()) };
         let gaussians = state.set.gaussians()?;
-        let now = self.mean_psnr(state, &gaussians, &self.probes(schedule), schedule.sh_degree)?;
+        let now = self.psnr_of_stage(state, &gaussians, schedule)?;
         if now >= reset.psnr_db - MAX_COST_DB {
             return Ok(());
         }
@@ -153,8 +181,14 @@ impl Context<'_> {
         Ok(())
     }
 
-    fn probes(&self, schedule: &Schedule) -> Vec<usize> {
-        spread_views(&self.job.scene, &self.stage_views(schedule.stage), PROBES)
+    /// PSNR in dB on full images of all frames of the stage: more of them may be trained on by the time that a reset is judged.
+    fn psnr_of_stage(&self, state: &mut TrainState, gaussians: &Gaussians, schedule: &Schedule) -> Result<f32> {
+        let scene = &self.job.scene;
+        self.mean_psnr(scene, state, gaussians, &spread_views(scene, &self.stage_views(schedule.stage), PROBES), schedule.sh_degree)
+    }
+
+    fn probes(&self, schedule: &Schedule) -> Probes {
+        Probes::new(&self.pyramid, &self.sampler(schedule), schedule)
     }
 }
 
@@ -206,6 +240,37 @@ fn lower_restored(plan: &mut DensityPlan, first: usize, logits: &[f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::RunConfig;
+    use crate::schedule::IMAGE_SCALES;
+    use cc4dgs_core::{Camera, NoImages, Seed, Split, View};
+
+    #[test]
+    fn removals_are_judged_on_what_is_trained_at_the_time() {
+        // Three cameras, ten frames that come in over 100 iterations.
+        let camera = |k: usize| Camera::look_at(&format!("c{k}"), (40, 20), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let view = |k: usize| View { camera: k % 3, frame: k / 3, time_norm: (k / 3) as f32 / 9.0, split: Split::Train };
+        let scene = Scene::new("s", (0..3).map(camera).collect(), (0..30).map(view).collect(), Arc::new(NoImages), 0).unwrap();
+        let mut config = RunConfig::resolve(Some("demo"), None, &[]).unwrap();
+        config.train.image_growth = 0.5;
+        let pyramid = Pyramid::new(&Arc::new(scene), &config).unwrap();
+        let all: Vec<usize> = (0..30).collect();
+        let ramp = Sampler::new(all.clone(), Seed::root(1), 1).with_ramp(|share| 100.0 * share, |view| (view / 3) as f32 / 9.0);
+        let at =
+            |sampler: &Sampler, iteration: usize, image_scale: f32| Probes::new(&pyramid, sampler, &Schedule { iteration, image_scale, ..Schedule::main(300) });
+        assert_eq!(at(&ramp, 1, 1.0).views, [0, 1, 2], "the first frame");
+        for (iteration, frames) in [(11, 1), (12, 2), (50, 5), (101, 10)] {
+            let probes = at(&ramp, iteration, 1.0);
+            assert!(probes.views.len() == PROBES && probes.views.iter().all(|view| view / 3 < frames), "{:?} at {iteration}", probes.views);
+        }
+        let late = at(&ramp, 101, 1.0);
+        assert!(late.same_as(&at(&Sampler::new(all, Seed::root(2), 4), 1, 1.0)), "all frames are open, whatever their order");
+        assert!(late.same_as(&at(&ramp, 300, 1.0)) && !late.same_as(&at(&ramp, 50, 1.0)));
+        for scale in IMAGE_SCALES {
+            let small = at(&ramp, 101, scale);
+            assert!(small.views == late.views && !small.same_as(&late) && small.same_as(&at(&ramp, 102, scale)));
+            assert_eq!(small.scene.cameras[0].width, (40.0 * scale).round() as u32);
+        }
+    }
 
     #[test]
     fn a_reset_reaches_rows_that_were_restored() {

@@ -5,6 +5,8 @@
 //! - A Gaussian that was drawn in fewer than 16 views stays longer, up to a sixth of the stage.
 //! - One round removes at most a quarter of the Gaussians.
 //! - A removal that costs more than 0.3 dB on training views at once is halved, the most opaque Gaussians being kept, and then left out.
+//! - It is measured on images of the size and of the frames that are trained on at the time. When images grow or frames come in, scores before and after cannot be
+//!   compared: what was lost before counts no more.
 //! - After a removal that was measured, what training views lost must be back within a stated number of iterations, to within 0.3 dB. Until then removals
 //!   together may cost no more than one; where the PSNR is lower, the next ones are put off. What is not back after three times as long has other causes.
 //! - Where a measured removal made the Gaussians fewer, growth does not replace them until training views have the PSNR of before it, or that time is over
