@@ -37,8 +37,9 @@ impl Output {
     pub fn begin(&self) -> Result<()> {
         let Some(file) = self.json_file() else { return Ok(()) };
         refuse_other_content(file, "a result that --json wrote", is_result)?;
-        match std::fs::remove_file(file) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(file, e)),
+        // A link stays, and leads to nothing until the result is written; devices and pipes stay, too.
+        match file.canonicalize() {
+            Ok(earlier) if earlier.is_file() => std::fs::remove_file(&earlier).map_err(|e| Error::io(&earlier, e)),
             _ => Ok(()),
         }
     }
@@ -190,6 +191,15 @@ mod tests {
             std::fs::write(&file, text).unwrap();
             begin(&file).unwrap();
             assert!(!file.exists());
+        }
+        #[cfg(unix)]
+        {
+            let link = folder.path().join("link");
+            std::os::unix::fs::symlink("out", &link).unwrap();
+            std::fs::write(&link, own).unwrap();
+            begin(&link).unwrap();
+            assert!(link.is_symlink() && !file.exists());
+            begin(&link).unwrap();
         }
         begin(Path::new("-")).unwrap();
         Output::new(None, true).begin().unwrap();

@@ -89,7 +89,7 @@ impl ArchiveWriter {
 }
 
 /// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On failure `path` is unchanged. Where `path` is a symbolic
-/// link, it stays one: the file that it leads to, which need not exist yet, is written in this way.
+/// link, it stays one: the file that it leads to, which need not exist yet, is written in this way. Devices and pipes get the bytes as they are.
 ///
 /// On `wasm32` there is no file system and the call is an error; use [`ArchiveWriter::to_bytes`] and similar functions.
 pub fn write_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
@@ -104,6 +104,9 @@ fn write_file(path: &Path, _bytes: &[u8]) -> Result<()> {
 #[cfg(not(target_arch = "wasm32"))]
 fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
     use std::io::Write;
+    if std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        return std::fs::OpenOptions::new().write(true).open(path).and_then(|mut device| device.write_all(bytes)).map_err(|e| Error::io(path, e));
+    }
     let path = &behind_links(path)?;
     let folder = match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
@@ -171,6 +174,21 @@ mod tests {
         symlink("round", at("round")).unwrap();
         let error = write_atomically(at("round"), b"lost").unwrap_err().to_string();
         assert!(error.contains("symbolic links") && is_link("round"), "{error}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_pipe_gets_the_bytes_and_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let reader = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || std::fs::read(pipe).unwrap()
+        });
+        write_atomically(&pipe, b"through").unwrap();
+        assert_eq!(reader.join().unwrap(), b"through");
+        assert!(!pipe.metadata().unwrap().is_file());
     }
 
     #[test]

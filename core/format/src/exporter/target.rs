@@ -72,16 +72,17 @@ fn refuse_unasked(path: &Path, overwrite: bool) -> Result<()> {
 }
 
 /// Refuses a `path` that exists and holds something else than what will be written there. `kind` says what that is ("a PNG image"); `is_kind` tells it by the
-/// first bytes of a file, 4,096 at most. An empty file may be replaced. Call it before long work.
+/// first bytes of a file, 4,096 at most. An empty file may be replaced, and a link that leads to nothing yet may be written through. Call it before long work.
 ///
 /// # Errors
 /// [`Error::Parameter`], and [`Error::Io`] for a file that cannot be read.
 pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8]) -> bool) -> Result<()> {
-    if path.symlink_metadata().is_err() {
+    let Ok(found) = std::fs::metadata(path) else { return Ok(()) };
+    let (mut head, is_file) = (Vec::new(), found.is_file());
+    if !is_file && !found.is_dir() {
+        // A device or a pipe holds nothing that could be lost.
         return Ok(());
     }
-    let mut head = Vec::new();
-    let is_file = path.is_file();
     if is_file {
         std::fs::File::open(path).and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head)).map_err(|e| Error::io(path, e))?;
     }
@@ -237,5 +238,13 @@ mod tests {
         }
         let message = check(folder.path()).unwrap_err().to_string();
         assert!(message.contains("not a list"), "{message}");
+        #[cfg(unix)]
+        {
+            let link = folder.path().join("link");
+            std::os::unix::fs::symlink("a", &link).unwrap();
+            assert!(check(&link).is_err());
+            std::fs::remove_file(&path).unwrap();
+            check(&link).unwrap();
+        }
     }
 }
