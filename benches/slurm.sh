@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Runs a tiny sweep through a real Slurm on this machine: the array through sbatch, one task requeued in the middle, then collected and compared with the same
-# sweep run by the local pool. Needs root and Debian's packages: apt-get install -y --no-install-recommends slurm-wlm munge
+# sweep run by the local pool. Another array gets the notice before a time limit, which must queue the task again, and is cancelled, which must not. Needs root
+# and Debian's packages: apt-get install -y --no-install-recommends slurm-wlm munge
 #   benches/slurm.sh OUT BIN [GRID] [ITERATIONS]
 set -euo pipefail
 [ $# -ge 2 ] || { echo "usage: benches/slurm.sh OUT BIN [GRID] [ITERATIONS]" >&2; exit 2; }
@@ -75,15 +76,16 @@ job=$(sbatch --parsable "$out/array.sh")
 echo "array job $job"
 # The first task is requeued once it has a checkpoint and is still training.
 first=$(python3 -c 'import json, sys; print(json.load(open(sys.argv[1]))["trainings"][0]["id"])' "$out/array/plan.json")
-requeued=no
-for _ in $(seq 1200); do
-    if [ -f "$out/array/trainings/$first/checkpoint" ]; then
-        scontrol requeue "${job}_0" && requeued=yes
-        break
-    fi
-    sleep 0.05
-done
-[ "$requeued" = yes ] || { echo "no checkpoint to requeue at; give more iterations" >&2; exit 5; }
+checkpoint() {
+    for _ in $(seq 1200); do
+        [ -f "$out/$1/trainings/$first/checkpoint" ] && return
+        sleep 0.05
+    done
+    echo "no checkpoint to stop at; give more iterations" >&2
+    exit 5
+}
+checkpoint array
+scontrol requeue "${job}_0"
 sleep 3
 trained=no
 [ -f "$out/array/trainings/$first/training.json" ] && trained=yes
@@ -94,15 +96,43 @@ while [ -n "$(squeue -h -j "$job" 2>/dev/null)" ]; do
     sleep 2
 done
 "$bin" --quiet sweep collect "$out/array"
+
+# The notice before the limit, which goes to the script alone: the task stops and is queued again. Then the array is cancelled while it trains, for good.
+"$bin" --quiet sweep plan "$grid" --iterations "$iterations" --out "$out/cancelled"
+"$bin" --quiet --threads 1 sweep emit slurm "$out/cancelled" --program "$bin" --memory-gb 1 --time-limit 30 >"$out/cancelled.sh"
+cancelled=$(sbatch --parsable "$out/cancelled.sh")
+checkpoint cancelled
+state() { squeue -h -j "${cancelled}_0" -o %T 2>/dev/null || true; }
+# scancel asks again and again where the task has stopped by then.
+timeout 2 scancel --batch --signal=USR1 "${cancelled}_0" || true
+for _ in $(seq 120); do [ "$(state)" = PENDING ] && break; sleep 0.25; done
+[ "$(state)" = PENDING ] || { echo "the notice did not queue the task again" >&2; exit 5; }
+for _ in $(seq 120); do
+    scontrol update JobId="${cancelled}_0" StartTime=now 2>/dev/null || true
+    [ "$(state)" = RUNNING ] && break
+    sleep 0.5
+done
+[ "$(state)" = RUNNING ] || { echo "the task that was queued again does not run" >&2; exit 5; }
+sleep 1
+scancel "$cancelled"
+for _ in $(seq 120); do [ -z "$(squeue -h -j "$cancelled" 2>/dev/null)" ] && break; sleep 0.5; done
+sleep 3
+[ -z "$(squeue -h -j "$cancelled" 2>/dev/null)" ] || { echo "the cancelled array is queued again" >&2; exit 5; }
+[ ! -f "$out/cancelled/trainings/$first/training.json" ] || { echo "the training was over before it was cancelled; give more iterations" >&2; exit 5; }
+"$bin" --quiet --threads 1 sweep run "$out/cancelled" --index 0
 python3 - "$out" "$here" "$job" <<'PYTHON'
 import json, pathlib, sys
 out, here, job = pathlib.Path(sys.argv[1]), sys.argv[2], sys.argv[3]
 sys.path.insert(0, here)
 import kill_sweep
 wrong = kill_sweep.compare(out / "pool", out / "array")
+resumed = list((out / "cancelled" / "archives").iterdir())
+wrong += [f"{file.name} of the cancelled array differs" for file in resumed if file.read_bytes() != (out / "pool" / "archives" / file.name).read_bytes()]
+if not resumed:
+    wrong.append("the cancelled array, run again, has no archive")
 cells = [json.loads(file.read_text()) for file in (out / "array" / "results").iterdir()]
 report = {**kill_sweep.program(out / "array"), "scheduler": "slurm", "cells": len(cells), "tasks": len({cell["training"] for cell in cells}),
-          "requeued_tasks": 1, "cells_of_resumed_trainings": sum(cell["cost"]["resumed"] > 0 for cell in cells), "wrong": wrong}
+          "requeued_tasks": 1, "queued_again_by_the_notice": 1, "cancelled_for_good": 1, "cells_of_resumed_trainings": sum(cell["cost"]["resumed"] > 0 for cell in cells), "wrong": wrong}
 (out / "slurm.json").write_text(json.dumps(report, indent=1) + "\n")
 print(json.dumps(report, indent=1))
 sys.exit(1 if wrong or not report["cells_of_resumed_trainings"] else 0)
