@@ -91,12 +91,12 @@ impl Content {
         Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, remarks, bytes })
     }
     /// Leaves out the highest degrees of the spherical harmonics until the rest take at most `most_words` 32-bit numbers: what one array of a device holds.
-    /// `remarks` say so then: what has no room for more (`room`), and what shows all degrees (`remedy`, a sentence without its full stop).
-    pub fn fit_harmonics(&mut self, most_words: u64, room: &str, remedy: &str) {
+    /// `remarks` say so then: the `array` that is too small for more, such as "a buffer", and what shows all degrees (`remedy`, a sentence without its full stop).
+    pub fn fit_harmonics(&mut self, most_words: u64, array: &str, remedy: &str) {
         self.scene.fit_harmonics(most_words);
         let (drawn, stored) = (self.scene.drawn_degree, self.scene.sh_degree);
         if drawn < stored {
-            self.remarks.push(format!("Spherical harmonics are shown up to degree {drawn} of {stored}: more do not fit into {room}. {remedy}."));
+            self.remarks.push(format!("Spherical harmonics are shown up to degree {drawn} of {stored}: more do not fit into {array}. {remedy}."));
         }
     }
     /// The small image to show while the rest is fetched, PNG or JPEG bytes, if the archive has one.
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn degrees_that_a_device_has_no_room_for_are_left_out_and_said() {
+    fn degrees_that_do_not_fit_into_an_array_of_the_device_are_left_out_and_said() {
         let content = |most_words: u64| {
             let mut content = Content::read("t", ply::to_bytes(&three(3), false).unwrap(), &Limits::default()).unwrap();
             content.fit_harmonics(most_words, "a buffer", "Use another device");

@@ -7,13 +7,13 @@ use cc4dgs_format::storage::{ColumnLoss, PartialLoss};
 use cc4dgs_format::{ExtraAttribute, HostGaussians};
 use rayon::prelude::*;
 
-/// The row at each place: those of the columns given, or those that are listed.
+/// Which row of the columns given is at each index of the result: the same, or the one that is listed.
 type Order<'a> = Option<&'a [usize]>;
 
 /// What the integers of `given` stand for, with the rows in this `order` `[N]`, or in that of `given`.
 pub fn restored(of: &Integers, given: Columns, order: Option<&[usize]>) -> HostGaussians {
     let mut sh_rest = vec![0.0; given.sh_rest.len()];
-    of.rest(given.sh_rest, |place| order.map_or(place, |order| order[place]), &mut sh_rest);
+    of.rest(given.sh_rest, |index| order.map_or(index, |order| order[index]), &mut sh_rest);
     let in_order = |attribute: &ExtraAttribute| order.map_or_else(|| attribute.clone(), |order| attribute.select(order));
     let extra = |(name, attribute): (&String, &ExtraAttribute)| {
         let coded = of.attributes.iter().find(|coded| coded.coding.name == *name);
@@ -78,8 +78,8 @@ impl Losses {
 /// A column `[N,width]` in this `order`, whose rows `restore` fills, except those that are stored `exact` (ascending), which are those of `given`.
 fn column(given: &[f32], width: usize, exact: &[usize], order: Order, restore: impl Fn(usize, &mut [f32]) + Sync) -> Vec<f32> {
     let mut out = vec![0.0; given.len()];
-    out.par_chunks_exact_mut(width).enumerate().for_each(|(place, values)| {
-        let row = order.map_or(place, |order| order[place]);
+    out.par_chunks_exact_mut(width).enumerate().for_each(|(index, values)| {
+        let row = order.map_or(index, |order| order[index]);
         if exact.binary_search(&row).is_ok() {
             values.copy_from_slice(&given[row * width..(row + 1) * width]);
         } else {
@@ -115,7 +115,7 @@ impl Integers<'_> {
         let codes_of = |i: usize| &codes.values[i * plan.dims..(i + 1) * plan.dims];
         column(given, plan.dims, &codes.missing, order, |i, out| plan.restore(&basis, codes_of(i), self.classes.colors[i], out))
     }
-    /// Fills `out` `[M,width]` with the higher degrees of the rows that `row_at` says are at each place; `given` are those of all rows.
+    /// Fills `out` `[M,width]` with the higher degrees: at each index those of the row that `row_at` names; `given` are those of all rows.
     fn rest(&self, given: &[f32], row_at: impl Fn(usize) -> usize + Sync, out: &mut [f32]) {
         let higher = || self.plan.degrees.iter().zip(&self.colors).skip(1);
         let width = higher().map(|(plan, _)| plan.dims).sum::<usize>();
@@ -123,8 +123,8 @@ impl Integers<'_> {
             return;
         }
         let bases: Vec<Vec<f32>> = higher().map(|(plan, _)| plan.scaled_basis()).collect();
-        out.par_chunks_exact_mut(width).enumerate().for_each(|(place, values)| {
-            let (row, mut at) = (row_at(place), 0);
+        out.par_chunks_exact_mut(width).enumerate().for_each(|(index, values)| {
+            let (row, mut at) = (row_at(index), 0);
             for ((plan, codes), basis) in higher().zip(&bases) {
                 let values = &mut values[at..at + plan.dims];
                 if codes.missing.binary_search(&row).is_ok() {
@@ -142,7 +142,7 @@ impl Integers<'_> {
         let mut block = vec![0.0; size.min(given.len())];
         for (k, values) in given.chunks(size.max(1)).enumerate() {
             let restored = &mut block[..values.len()];
-            self.rest(given, |place| k * ROWS + place, restored);
+            self.rest(given, |index| k * ROWS + index, restored);
             loss.add(values, restored);
         }
         loss.loss()
@@ -178,7 +178,7 @@ mod tests {
         assert_eq!([3, 4, 200].map(|row| of_degree(&whole, row) == of_degree(&g, row)), [true, false, true]);
         for (first, rows) in [(0, 300), (0, 4), (3, 1), (4, 196), (199, 2), (201, 99)] {
             let mut part = vec![0.0; 24 * rows];
-            of.rest(&g.sh_rest, |place| first + place, &mut part);
+            of.rest(&g.sh_rest, |index| first + index, &mut part);
             assert!(part == whole.sh_rest[24 * first..24 * (first + rows)], "{rows} rows from {first} on");
         }
         let found = losses(&of, columns, &planner.losses, [None; 6]);
@@ -192,7 +192,7 @@ mod tests {
         of.colors[0].missing = vec![11];
         let extra = [("velocity".to_string(), ExtraAttribute::exact(1, (0..300).map(|row| row as f32).collect()))].into();
         let columns = Columns { extra: &extra, ..columns };
-        let (own, order) = (restored(&of, columns, None), (0..300).map(|place| place * 7 % 300).collect::<Vec<usize>>());
+        let (own, order) = (restored(&of, columns, None), (0..300).map(|index| index * 7 % 300).collect::<Vec<usize>>());
         assert!(own.means[21..24] == g.means[21..24] && own.sh_dc[33..36] == g.sh_dc[33..36] && own.means != whole.means);
         assert!(restored(&of, columns, Some(&order)) == own.select(&order));
     }

@@ -91,11 +91,11 @@ impl Tried {
     }
 }
 
-/// What attempts have found. Places are octaves over the step factor at the start, in the direction in which more is used.
+/// What attempts have found. Their octaves are those of the step factor over the one at the start, in the direction in which more is used.
 struct Found {
-    /// The attempt that uses most of what is allowed, and its place.
+    /// The attempt that uses most of what is allowed, after its octaves.
     best: Option<(f64, Tried)>,
-    /// Of those that use too much, the one that uses least, and the first place of any.
+    /// Of those that use too much, the one that uses least, and the fewest octaves of any.
     least: Option<Tried>,
     refused: f64,
 }

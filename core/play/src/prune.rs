@@ -3,7 +3,7 @@
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::model::Model;
 use burn::tensor::Device;
-use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews, psnr_on_views};
+use cc4dgs_core::{Camera, Error, Event, EventSink, HostGaussians, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews, psnr_on_views};
 use serde::Serialize;
 
 /// Training views from which contributions are taken.
@@ -44,14 +44,14 @@ pub fn contributions(model: &Model, scene: &Scene, registry: &Registry, device: 
     let chosen = views.len().min(VIEWS);
     let seed = Seed::root(model.provenance.seed).child("prune");
     let mut sum = vec![0.0; model.gaussians.len()];
-    for k in 0..chosen {
-        let (camera, time_norm) = views.view(k * views.len() / chosen);
-        let Some(found) = services.squared_derivatives(&model.gaussians, camera, time_norm, seed.index(k as u64))? else { break };
+    let shown: Vec<(&Camera, f32)> = (0..chosen).map(|k| views.view(k * views.len() / chosen)).collect();
+    services.squared_derivatives_in_views(&model.gaussians, &shown, seed, &mut |k, found, _| {
         for (sum, row) in sum.iter_mut().zip(found.sh_dc.chunks_exact(3)) {
             *sum += row.iter().map(|&v| f64::from(v)).sum::<f64>() / chosen as f64;
         }
         events.emit(&Event::Progress { task: "contributions".into(), done: k as u64 + 1, total: chosen as u64 });
-    }
+        Ok(())
+    })?;
     Ok(sum)
 }
 

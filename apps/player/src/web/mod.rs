@@ -126,11 +126,11 @@ impl Player {
         Ok(())
     }
     fn show(&mut self, mut content: Content, first: bool) -> Result<String, JsError> {
-        let (most_words, room, remedy) = match &self.output {
+        let (most_words, array, remedy) = match &self.output {
             Output::WebGpu { renderer, .. } => (renderer.most_words(), "a buffer of WebGPU here", "`cc4dgs view` may show all"),
             Output::Plain { most_words, .. } => (*most_words, "a texture of WebGL2", "Use a browser with WebGPU to see all"),
         };
-        content.fit_harmonics(most_words, room, remedy);
+        content.fit_harmonics(most_words, array, remedy);
         let Content { scene, presentation, frame_count, lacks_motion, remarks, bytes } = content;
         let (count, moving, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.gpu_bytes(), scene.bounds);
         let degrees = [scene.drawn_degree, scene.sh_degree];

@@ -16,7 +16,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 impl Context<'_> {
-    /// Runs `stage` from where `state` stands to its end. `ends` is when the run is to end, where that was planned.
+    /// Runs `stage` from where `state` stands to its end.
     pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
         let events = self.job.events;
         if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
