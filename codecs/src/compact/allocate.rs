@@ -30,11 +30,11 @@ pub fn allocate(
     let images = Images::of(whole, views, renderer, views.len().min(budget(WORK, whole.len(), VIEWS)))?;
     let measure = |factors: &Factors| -> Result<(f64, f64)> {
         let (streams, rounded) = job.coded_and_restored(quality, factors)?;
-        Ok((images.error(&rounded)?, bytes_of(&streams) as f64))
+        Ok((images.error(rounded)?, bytes_of(&streams) as f64))
     };
     let mut factors: Factors = [1.0; 6];
     let (error, bytes) = match known {
-        Some((plan, bytes)) => (images.error(&job.restored(job.planner.gaussians, plan))?, bytes as f64),
+        Some((plan, bytes)) => (images.error(job.restored(job.planner.gaussians, plan))?, bytes as f64),
         None => measure(&factors)?,
     };
     // With a factor f, the error of a column is a f² and its size b - c log2 f.

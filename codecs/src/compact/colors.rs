@@ -3,6 +3,7 @@
 use super::blocks::ROWS;
 use super::columns::Rows;
 use super::entropy::{Coder, LANES, Lanes, behind, symbol_of};
+use super::geometry::{CODE_LIMIT, NEAREST_LIMIT, nearest};
 use super::transform::{Basis, Moments, analysis, identity, scaled};
 use crate::jacobi;
 use cc4dgs_format::Result;
@@ -28,8 +29,6 @@ const MEAN: f64 = 0.7;
 const BIT: f64 = 0.1155;
 /// Largest share of a step by which a coordinate is rounded towards zero.
 const FARTHEST: f64 = 0.4;
-/// Most coefficients times channels of a degree: those of degree 4.
-const MOST_DIMS: usize = 3 * (2 * 4 + 1);
 
 /// The coefficients of one degree, all channels.
 #[derive(PartialEq)]
@@ -118,6 +117,10 @@ impl Codes {
 
 /// The rows that are not `coded`.
 pub fn missing(coded: &[bool]) -> Vec<usize> {
+    // Nearly always none is missing, which vectors see faster than a loop that may end.
+    if coded.iter().fold(true, |all, coded| all & coded) {
+        return Vec::new();
+    }
     coded.iter().enumerate().filter(|(_, coded)| !**coded).map(|(row, _)| row).collect()
 }
 
@@ -149,19 +152,30 @@ impl Degree {
     }
     /// Puts the codes of a row into `codes`; whether all are in range. `columns` are those of the analysis.
     fn quantise_row(&self, columns: &[f64], row: &[f32], class: u8, rate_weight: f64, codes: &mut [i32]) -> bool {
-        let (step, mut coordinates) = (self.step_of(class), [0.0; MOST_DIMS]);
         match self.dims {
-            3 => project_all::<3>(columns, row, &self.mean, &mut coordinates),
-            9 => project_all::<9>(columns, row, &self.mean, &mut coordinates),
-            15 => project_all::<15>(columns, row, &self.mean, &mut coordinates),
-            21 => project_all::<21>(columns, row, &self.mean, &mut coordinates),
-            _ => project_all::<27>(columns, row, &self.mean, &mut coordinates),
+            3 => self.quantise_dims::<3>(columns, row, class, rate_weight, codes),
+            9 => self.quantise_dims::<9>(columns, row, class, rate_weight, codes),
+            15 => self.quantise_dims::<15>(columns, row, class, rate_weight, codes),
+            21 => self.quantise_dims::<21>(columns, row, class, rate_weight, codes),
+            _ => self.quantise_dims::<27>(columns, row, class, rate_weight, codes),
         }
-        codes.iter_mut().zip(coordinates).enumerate().all(|(c, (out, coordinate))| {
-            let steps = coordinate / step;
-            let code = libm::copysign(self.rounded(steps.abs(), c, class, rate_weight), steps);
+    }
+    #[inline]
+    fn quantise_dims<const DIMS: usize>(&self, columns: &[f64], row: &[f32], class: u8, rate_weight: f64, codes: &mut [i32]) -> bool {
+        let step = self.step_of(class);
+        let steps = project_all::<DIMS>(columns, row, &self.mean).map(|coordinate| coordinate / step);
+        if rate_weight == 0.0 {
+            // All together: what is out of range is rare.
+            let in_range = steps.iter().fold(true, |all, steps| all & (steps.abs() < NEAREST_LIMIT));
+            if in_range {
+                codes.iter_mut().zip(steps).for_each(|(code, steps)| *code = nearest(steps));
+            }
+            return in_range;
+        }
+        codes.iter_mut().zip(steps).enumerate().all(|(c, (out, steps))| {
+            let code = libm::copysign(self.rounded_down(steps.abs(), c, class, rate_weight), steps);
             *out = code as i32;
-            code.abs() < f64::from(1 << 24)
+            code.abs() < CODE_LIMIT as f64
         })
     }
     /// The derivative `[N,dims]` of the estimated bits of all coordinates by each of the values `rows`; `guesses` `[N,dims]` are predictions in steps.
@@ -200,11 +214,8 @@ impl Degree {
         f64::from(self.step) * f64::from(1u32 << class)
     }
     /// A magnitude in steps, rounded down where that costs less than the bits it saves: coordinates are thought to have a Laplace distribution.
-    fn rounded(&self, steps: f64, c: usize, class: u8, rate_weight: f64) -> f64 {
+    fn rounded_down(&self, steps: f64, c: usize, class: u8, rate_weight: f64) -> f64 {
         let down = libm::floor(steps);
-        if rate_weight == 0.0 {
-            return if steps - down < 0.5 { down } else { down + 1.0 };
-        }
         let mean = (MEAN * libm::exp2(0.5 * f64::from(i32::from(self.spread[c]) - ONE_STEP) - f64::from(class))).max(0.05);
         // From one code to the next the logarithm of the probability falls by 1 / mean; the first one has a sign.
         let bits = std::f64::consts::LOG2_E / mean + f64::from(u8::from(down == 0.0));
@@ -365,13 +376,13 @@ fn project(analysis: &[f64], row: &[f64]) -> f64 {
 
 /// All coordinates of `row` less `mean`, each summed up in the order of [`project`], but side by side: sums do not wait for each other.
 #[inline]
-fn project_all<const DIMS: usize>(columns: &[f64], row: &[f32], mean: &[f32], coordinates: &mut [f64; MOST_DIMS]) {
+fn project_all<const DIMS: usize>(columns: &[f64], row: &[f32], mean: &[f32]) -> [f64; DIMS] {
     let mut sums = [0.0; DIMS];
     for (column, (&value, &mean)) in columns.as_chunks::<DIMS>().0.iter().zip(row.iter().zip(mean)) {
         let value = f64::from(value) - f64::from(mean);
         sums.iter_mut().zip(column).for_each(|(sum, a)| *sum += a * value);
     }
-    coordinates[..DIMS].copy_from_slice(&sums);
+    sums
 }
 
 /// Contexts of [`code_small`].

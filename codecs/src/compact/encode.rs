@@ -3,7 +3,7 @@
 use super::attributes::Coded;
 use super::colors::{Choices, Codes, missing};
 use super::columns::Columns;
-use super::geometry::{CODE_LIMIT, Rotation, companded};
+use super::geometry::{Geometry, Rotation, code_of, companded};
 use super::joint::Directions;
 use super::plan::Plan;
 use super::write::APART;
@@ -40,10 +40,23 @@ impl Integers<'_> {
     pub fn exact_rows(&self) -> impl Iterator<Item = &[usize]> {
         self.exact.iter().chain(self.colors.iter().map(|codes| &codes.missing)).map(Vec::as_slice)
     }
-    /// The codes of colours alone.
-    pub fn into_colors(self) -> Vec<Codes> {
-        self.colors
+    /// What does not borrow the plan.
+    pub fn into_parts(self) -> Parts {
+        let Self { scales, rotations, opacities, keys, colors, exact, .. } = self;
+        Parts { scales, rotations, opacities, keys, colors, exact }
     }
+}
+
+/// The integers of a plan, which another of the same planner may take over.
+#[derive(Default)]
+pub struct Parts {
+    scales: Vec<[i32; 3]>,
+    rotations: Vec<Rotation>,
+    opacities: Vec<i32>,
+    keys: Vec<u64>,
+    /// Of each degree.
+    pub colors: Vec<Codes>,
+    exact: [Vec<usize>; 4],
 }
 
 /// Brings log-scales `[N,3]` and quaternions `[N,4]` into canonical form where they are `free`: nothing is added to them, so the order of the axes and the sign
@@ -159,10 +172,10 @@ impl Plan {
     }
     /// The codes of the colours of canonical Gaussians, by degree. With `directions`, colours are rounded together if they may be. `before` are the codes of
     /// the same Gaussians with another plan of the same planner: they are taken for degrees that are rounded alike.
-    pub fn color_codes(&self, gaussians: Columns, classes: &Classes, directions: Option<&Directions>, before: Option<(Self, Vec<Codes>)>) -> Vec<Codes> {
+    pub fn color_codes(&self, gaussians: Columns, classes: &Classes, directions: Option<&Directions>, before: Option<(&Self, Vec<Codes>)>) -> Vec<Codes> {
         let mut known: Vec<Option<Codes>> = self.degrees.iter().map(|_| None).collect();
         if let Some((plan, codes)) = before {
-            known = codes.into_iter().zip(self.keeps_colors(&plan, directions)).map(|(codes, keeps)| Some(codes).filter(|_| keeps)).collect();
+            known = codes.into_iter().zip(self.keeps_colors(plan, directions)).map(|(codes, keeps)| Some(codes).filter(|_| keeps)).collect();
         }
         let exact = |dims: usize| Codes::none(gaussians.len(), dims);
         if let Some(directions) = self.together(directions).filter(|_| known.iter().any(Option::is_none)) {
@@ -181,30 +194,56 @@ impl Plan {
         };
         known.into_iter().enumerate().map(|(degree, known)| known.unwrap_or_else(|| alone(degree))).collect()
     }
+    /// Whether means, log-scales, quaternions and opacity logits have the integers that they have with `before`, a plan of the same planner, and so lose as
+    /// much.
+    pub fn keeps_shapes(&self, before: &Self) -> [bool; 4] {
+        let rounds = |column: usize| self.rounds[column] == before.rounds[column];
+        let (own, other) = (&self.geometry, &before.geometry);
+        let scales = rounds(1) && (own.scale_origin, own.scale_step, own.scale_limit) == (other.scale_origin, other.scale_step, other.scale_limit);
+        let grid = |of: &Geometry| (of.corner, of.cell, of.size_floor, of.class_limit);
+        // Steps of centres and rotations follow from the codes of scales.
+        let means = scales && rounds(0) && grid(own) == grid(other);
+        let quaternions = scales && rounds(2) && own.rotation_step == other.rotation_step;
+        let opacities = rounds(3) && (own.opacity_step, own.opacity_limit) == (other.opacity_step, other.opacity_limit);
+        [means, scales, quaternions, opacities]
+    }
     /// The integers of canonical Gaussians, as many as those that were planned for, whose `colors` have been rounded.
     pub fn quantise<'a>(&'a self, gaussians: Columns, free: &[bool], classes: &'a Classes, colors: Vec<Codes>) -> Integers<'a> {
+        self.quantise_after(gaussians, free, classes, colors, None)
+    }
+    /// The same after those of another plan of the same planner: what this one keeps of them ([`Plan::keeps_shapes`]) is not rounded again.
+    pub fn quantise_after<'a>(
+        &'a self,
+        gaussians: Columns,
+        free: &[bool],
+        classes: &'a Classes,
+        colors: Vec<Codes>,
+        before: Option<(Self, Parts)>,
+    ) -> Integers<'a> {
         let (geometry, shapes, n) = (&self.geometry, &classes.shapes, gaussians.len());
-        let (scales, exact_scales) = each(n, |i| {
+        let (keeps, known) = before.map_or_else(Default::default, |(plan, parts)| (self.keeps_shapes(&plan), parts));
+        let [known_means, known_scales, known_rotations, known_opacities] = known.exact;
+        let (scales, exact_scales) = or_each(keeps[1].then_some((known.scales, known_scales)), n, |i| {
             let (values, step) = (&gaussians.log_scales[3 * i..3 * i + 3], geometry.scale_step_of(shapes[i]));
-            let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
+            let found: [Option<i32>; 3] = std::array::from_fn(|k| code_of((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
             match found {
                 [Some(a), Some(b), Some(c)] if self.rounds[1] && values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => Some([a, b, c]),
                 _ => None,
             }
         });
-        let (keys, exact_means) = each(n, |i| {
+        let (keys, exact_means) = or_each(keeps[0].then_some((known.keys, known_means)), n, |i| {
             let mean = &gaussians.means[3 * i..3 * i + 3];
             geometry.key(mean, geometry.position_shift(scales[i], shapes[i])).filter(|_| self.rounds[0])
         });
-        let (rotations, exact_rotations) = each(n, |i| {
+        let (rotations, exact_rotations) = or_each(keeps[2].then_some((known.rotations, known_rotations)), n, |i| {
             let q = &gaussians.quaternions[4 * i..4 * i + 4];
             let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
             let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
             Some(norm).filter(|norm| self.rounds[2] && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i]))
         });
-        let (opacities, exact_opacities) = each(n, |i| {
+        let (opacities, exact_opacities) = or_each(keeps[3].then_some((known.opacities, known_opacities)), n, |i| {
             let logit = gaussians.opacity_logits[i];
-            code(companded(logit) / geometry.opacity_step_of(shapes[i])).filter(|_| self.rounds[3] && logit.abs() < LOGIT_LIMIT)
+            code_of(companded(logit) / geometry.opacity_step_of(shapes[i])).filter(|_| self.rounds[3] && logit.abs() < LOGIT_LIMIT)
         });
         let attributes = self.attributes.iter().filter_map(|(coding, rows)| Coded::new(coding, rows, gaussians, geometry, &scales, shapes)).collect();
         let exact = [exact_means, exact_scales, exact_rotations, exact_opacities];
@@ -212,17 +251,15 @@ impl Plan {
     }
 }
 
-/// The codes of `n` rows, and the rows that have none.
-fn each<T: Default + Send>(n: usize, code: impl Fn(usize) -> Option<T> + Send + Sync) -> (Vec<T>, Vec<usize>) {
+/// The codes of `n` rows, and the rows that have none: those that are `known`, or what `code` says of each row.
+fn or_each<T: Default + Send>(known: Option<(Vec<T>, Vec<usize>)>, n: usize, code: impl Fn(usize) -> Option<T> + Send + Sync) -> (Vec<T>, Vec<usize>) {
+    if let Some(known) = known {
+        return known;
+    }
     let (mut codes, mut coded) = (Vec::new(), Vec::new());
     let row = |i: usize| code(i).map_or_else(|| (T::default(), false), |code| (code, true));
     (0..n).into_par_iter().map(row).unzip_into_vecs(&mut codes, &mut coded);
     (codes, missing(&coded))
-}
-
-fn code(steps: f64) -> Option<i32> {
-    let code = steps.round();
-    (code.abs() < CODE_LIMIT as f64).then_some(code as i32)
 }
 
 #[cfg(test)]
@@ -254,7 +291,7 @@ mod tests {
             let wanted: Vec<i32> = codes.iter().map(|codes| codes.values[0]).collect();
             let next = plan(largest, joint);
             let keeps = next.keeps_colors(&before, directions);
-            let found = next.color_codes(columns, &classes, directions, Some((before, codes)));
+            let found = next.color_codes(columns, &classes, directions, Some((&before, codes)));
             let afresh = next.color_codes(columns, &classes, directions, None);
             let kept: Vec<bool> = found.iter().zip(wanted).map(|(found, wanted)| found.values[0] == wanted).collect();
             assert!(kept.iter().zip(found.iter().zip(&afresh)).all(|(kept, (found, afresh))| *kept || found == afresh));
@@ -268,5 +305,47 @@ mod tests {
         assert_eq!(kept(Some(&directions), centres, true), [true; 3]);
         assert_eq!(kept(Some(&directions), harmonics, true), [false; 3]);
         assert_eq!(kept(Some(&directions), centres, false), [false; 3], "apart");
+    }
+
+    #[test]
+    fn shapes_are_kept_where_a_plan_rounds_them_as_the_one_before() {
+        let draw = |k: usize, column: usize| (Seed::root(column as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+        let mut g = HostGaussians { opacity_logits: vec![0.0; 80], ..Default::default() };
+        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
+            *values = (0..80 * width).map(|k| draw(k, column)).collect();
+        }
+        // Rows that no step can hold.
+        (g.means[4], g.log_scales[7], g.opacity_logits[9]) = (f32::MAX, 80.0, 70.0);
+        g.quaternions[..4].fill(100.0);
+        let columns = Columns::from(&g);
+        let mut importance = importance::estimate(&g, &CodecContext::new(Seed::root(1), Limits::default(), &Silent));
+        // Some classes have the largest steps.
+        importance.shapes.iter_mut().enumerate().filter(|(k, _)| k % 3 > 0).for_each(|(_, w)| *w *= 1e-2);
+        let classes = classify(&importance.weights, &importance.shapes, true);
+        let planner = Planner::new(columns, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
+        let plan = |largest: [f64; 6]| planner.plan(0.5, &[1.0; 6], &Bounds { largest, joint: false });
+        let integers = |of: &Integers| {
+            let rotations: Vec<([i32; 3], u8, i32)> = of.rotations.iter().map(|r| (r.codes, r.form, r.norm)).collect();
+            (of.keys.clone(), of.scales.clone(), rotations, of.opacities.clone(), of.exact.clone())
+        };
+        let kept = |largest: [f64; 6]| -> [bool; 4] {
+            let (before, next) = (plan([1.0; 6]), plan(largest));
+            let mut parts = before.quantise(columns, &[false; 80], &classes, Vec::new()).into_parts();
+            let keeps = next.keeps_shapes(&before);
+            let found = next.quantise_after(columns, &[false; 80], &classes, Vec::new(), Some((plan([1.0; 6]), parts)));
+            let afresh = next.quantise(columns, &[false; 80], &classes, Vec::new());
+            assert!(integers(&found) == integers(&afresh), "{largest:?}");
+            // What is kept can be told from what is rounded again.
+            parts = found.into_parts();
+            (parts.keys[0], parts.scales[0][0], parts.rotations[0].norm, parts.opacities[0]) = (u64::MAX, 1234, 1234, 1234);
+            let found = next.quantise_after(columns, &[false; 80], &classes, Vec::new(), Some((before, parts)));
+            let marks = [found.keys[0] == u64::MAX, found.scales[0][0] == 1234, found.rotations[0].norm == 1234, found.opacities[0] == 1234];
+            assert_eq!(marks, keeps);
+            keeps
+        };
+        assert_eq!(kept([1.0; 6]), [true; 4]);
+        assert_eq!(kept([0.1, 1.0, 1.0, 1.0, 1.0, 1.0]), [false, true, true, true]);
+        assert_eq!(kept([1.0, 0.1, 1.0, 1.0, 1.0, 1.0]), [false, false, false, true]);
+        assert_eq!(kept([1.0, 1.0, 0.1, 0.0, 0.1, 0.1]), [true, true, false, false]);
     }
 }

@@ -145,14 +145,38 @@ impl Geometry {
     pub fn key(&self, mean: &[f32], shift: u32) -> Option<u64> {
         let mut key = 0;
         for (axis, (&value, corner)) in mean.iter().zip(self.corner).enumerate() {
-            let cell = libm::floor((f64::from(value) - corner) / self.cell);
-            if !(0.0..f64::from(1u32 << GRID_BITS)).contains(&cell) {
+            let cells = (f64::from(value) - corner) / self.cell;
+            if !(0.0..f64::from(1u32 << GRID_BITS)).contains(&cells) {
                 return None;
             }
-            key |= spread(cell as u64 >> shift << shift) << axis;
+            key |= spread(cells as u64 >> shift << shift) << axis;
         }
         Some(key)
     }
+}
+
+/// The integer nearest to a number whose magnitude is below 2^31; of two, the one farther from zero, as of [`f64::round`]. It has no branches, which would wait
+/// for values that cannot be foreseen, and calls nothing.
+#[inline(always)]
+pub fn nearest(value: f64) -> i32 {
+    /// Neighbours of numbers of this size are 1 apart.
+    const WHOLE: f64 = (1u64 << 52) as f64;
+    let magnitude = value.abs();
+    let shifted = magnitude + WHOLE;
+    // That has rounded halves to even numbers.
+    let up = if magnitude - (shifted - WHOLE) >= 0.5 { 1.0 } else { 0.0 };
+    // The low bits of the mantissa.
+    let code = (shifted + up).to_bits() as i32;
+    if value < 0.0 { -code } else { code }
+}
+
+/// Numbers of steps of a smaller magnitude have codes in range; NaN has none.
+pub const NEAREST_LIMIT: f64 = CODE_LIMIT as f64 - 0.5;
+
+/// The code of a number of steps; `None` where it is out of range.
+#[inline(always)]
+pub fn code_of(steps: f64) -> Option<i32> {
+    if steps.abs() < NEAREST_LIMIT { Some(nearest(steps)) } else { None }
 }
 
 fn sorted([a, b, c]: [i32; 3]) -> [i32; 3] {
@@ -183,8 +207,7 @@ impl Rotation {
         let mut out =
             Self { form: 2 * index as u8 + u8::from(unit[index] < 0.0), norm: libm::round(libm::log(norm.abs()) / NORM_STEP) as i32, ..Default::default() };
         for (code, k) in out.codes.iter_mut().zip((0..4).filter(|k| *k != index)) {
-            let found = (unit[k] / step).round();
-            *code = (found.abs() < CODE_LIMIT as f64).then_some(found as i32)?;
+            *code = code_of(unit[k] / step)?;
         }
         Some(out)
     }
@@ -272,4 +295,32 @@ pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: &[u32]) -> R
 #[inline]
 pub fn checked(code: i64) -> Result<i32> {
     if code.abs() < CODE_LIMIT { Ok(code as i32) } else { Err(Error::data("entropy-coded integer", format!("{code} is out of range"), "The file is damaged")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_are_those_of_rounding() {
+        let halves = [0.0, 0.49999999999999994, 0.5, 0.5000000000000001, 1.0, 1.4999999999999998, 1.5, 2.5, 3.5, 1e-300, 4095.5, 16_777_214.5, 16_777_215.0];
+        let drawn = (0..2000).map(|k| f64::from(k) * 0.37 + (f64::from(k) * 7.3).sin());
+        for steps in halves.into_iter().chain(drawn).flat_map(|v| [v, -v]) {
+            assert_eq!(code_of(steps), Some(steps.round() as i32), "{steps}");
+        }
+        for steps in [16_777_215.5, -16_777_216.0, 1e300, f64::INFINITY, f64::NEG_INFINITY, f64::NAN] {
+            assert_eq!(code_of(steps), None, "{steps}");
+        }
+    }
+
+    #[test]
+    fn centres_outside_of_the_grid_have_no_key() {
+        let geometry = Geometry { cell: 0.25, ..Geometry::new(0.0, 1.0, 1.0, 1.0) };
+        let end = 0.25 * (1u32 << GRID_BITS) as f32;
+        assert_eq!(geometry.key(&[0.9, -0.0, 0.25], 0), Some(spread(3) | spread(1) << 2));
+        assert_eq!(geometry.key(&[0.9, 0.0, 0.25], 1), Some(spread(2)));
+        for outside in [-1e-9, end, f32::NAN, f32::INFINITY] {
+            assert_eq!(geometry.key(&[0.0, outside, 0.0], 0), None, "{outside}");
+        }
+    }
 }

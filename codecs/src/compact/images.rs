@@ -24,9 +24,9 @@ impl<'a> Recorded<'a> {
         self.views.len()
     }
     /// The mean PSNR of `gaussians` in dB ([`cc4dgs_format::psnr_on_views`]).
-    pub fn psnr(&self, gaussians: &HostGaussians) -> Result<f64> {
+    pub fn psnr(&self, gaussians: HostGaussians) -> Result<f64> {
         let mut sum = 0.0;
-        self.renderer.render_views(gaussians, &self.views, &mut |k, drawn| {
+        self.renderer.render_views_once(gaussians, &self.views, &mut |k, drawn| {
             sum += drawn.psnr(&self.truths[k]);
             Ok(())
         })?;
@@ -61,13 +61,13 @@ impl<'a> Images<'a> {
         self.views.len()
     }
     /// The sum over views, pixels and channels of the squared errors of `changed`.
-    pub fn error(&self, changed: &HostGaussians) -> Result<f64> {
+    pub fn error(&self, changed: HostGaussians) -> Result<f64> {
         self.error_of(changed, |v| v)
     }
     /// The same of colours that are `shown` as.
-    fn error_of(&self, changed: &HostGaussians, shown: impl Fn(f32) -> f32) -> Result<f64> {
+    fn error_of(&self, changed: HostGaussians, shown: impl Fn(f32) -> f32) -> Result<f64> {
         let mut error = 0.0;
-        self.renderer.render_views(changed, &self.views, &mut |k, drawn| {
+        self.renderer.render_views_once(changed, &self.views, &mut |k, drawn| {
             error += self.originals[k].iter().zip(&drawn.planes).map(|(a, b)| f64::from(shown(*a) - shown(*b)).powi(2)).sum::<f64>();
             Ok(())
         })?;
@@ -82,7 +82,7 @@ impl<'a> Images<'a> {
     }
     /// The mean over views, pixels and channels of the squared errors of `changed`, with colours as screens show them, in 0..1; infinite where one is not a
     /// number.
-    pub fn mean_squared_error(&self, changed: &HostGaussians) -> Result<f64> {
+    pub fn mean_squared_error(&self, changed: HostGaussians) -> Result<f64> {
         let samples: usize = self.originals.iter().map(Vec::len).sum();
         let error = self.error_of(changed, |v| v.clamp(0.0, 1.0))? / samples.max(1) as f64;
         Ok(if error.is_nan() { f64::INFINITY } else { error })

@@ -1,9 +1,8 @@
 //! Gaussians in the steps of a quality: rounded, restored and coded, as often as the search for the quality asks for it.
 
 use super::LOSSES;
-use super::colors::Codes;
 use super::columns::Columns;
-use super::encode::Integers;
+use super::encode::{Integers, Parts};
 use super::joint::Directions;
 use super::plan::{Bounds, Factors, Plan, Planner};
 use super::restore::{losses, restored};
@@ -73,16 +72,17 @@ impl Job<'_> {
     /// Rounds the Gaussians of `planner` in steps that keep the declared loss; `work` gets their integers.
     fn attempt_with<T>(&self, planner: &Planner, quality: f64, factors: &Factors, work: impl FnOnce(Integers) -> Result<T>) -> Result<(Attempt, T)> {
         let joint = self.joint.get();
-        let (mut bounds, mut before, mut lost) = (Bounds { joint, ..Bounds::NONE }, None, Vec::<f64>::new());
+        let (mut bounds, mut before, mut lost) = (Bounds { joint, ..Bounds::NONE }, None::<(Plan, Parts)>, Vec::<f64>::new());
         // Colours may be rounded apart, and each column be stored exactly in the end.
         for reductions in 0..REDUCTIONS + 2 + factors.len() {
             let plan = planner.plan(quality, factors, &bounds);
-            // Colours that keep their codes lose what they lost.
-            let keeps = before.as_ref().map(|(before, _): &(Plan, Vec<Codes>)| plan.keeps_colors(before, self.directions)).unwrap_or_default();
+            // Columns that keep their codes lose what they lost.
+            let keeps = before.as_ref().map(|(before, _)| (plan.keeps_shapes(before), plan.keeps_colors(before, self.directions)));
+            let (shapes, colors) = keeps.unwrap_or_default();
             let known = |column: usize| match column {
-                4 => keeps.first() == Some(&true),
-                5 => keeps.len() > 1 && !keeps[1..].contains(&false),
-                _ => false,
+                4 => colors.first() == Some(&true),
+                5 => colors.len() > 1 && !colors[1..].contains(&false),
+                _ => shapes[column],
             };
             let known = std::array::from_fn(|column| lost.get(column).copied().filter(|_| known(column)));
             let of = self.quantise(planner.gaussians, &plan, before.take());
@@ -106,8 +106,8 @@ impl Job<'_> {
                 return Ok((Attempt { quality, factors: *factors, joint, plan }, found));
             }
             // Most columns keep their steps.
-            let colors = of.into_colors();
-            before = Some((plan, colors));
+            let parts = of.into_parts();
+            before = Some((plan, parts));
         }
         Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
     }
@@ -115,12 +115,13 @@ impl Job<'_> {
     pub fn repeats(&self, attempt: &Attempt, quality: f64, factors: &Factors) -> bool {
         attempt.quality == quality && attempt.factors == *factors && attempt.joint == self.joint.get()
     }
-    /// The integers of canonical Gaussians; `before` are the codes of their colours with another plan of the same planner.
-    pub fn quantise<'a>(&'a self, gaussians: Columns, plan: &'a Plan, before: Option<(Plan, Vec<Codes>)>) -> Integers<'a> {
+    /// The integers of canonical Gaussians; `before` are those with another plan of the same planner.
+    pub fn quantise<'a>(&'a self, gaussians: Columns, plan: &'a Plan, mut before: Option<(Plan, Parts)>) -> Integers<'a> {
         #[cfg(test)]
         QUANTISED.set(QUANTISED.get() + 1);
-        let colors = plan.color_codes(gaussians, self.planner.classes, self.directions, before);
-        plan.quantise(gaussians, &self.free, self.planner.classes, colors)
+        let known = before.as_mut().map(|(other, parts)| (&*other, std::mem::take(&mut parts.colors)));
+        let colors = plan.color_codes(gaussians, self.planner.classes, self.directions, known);
+        plan.quantise_after(gaussians, &self.free, self.planner.classes, colors, before)
     }
     /// The streams of canonical Gaussians as `plan` rounds them.
     pub fn streams(&self, gaussians: Columns, plan: &Plan) -> Result<Vec<Stream>> {
@@ -151,9 +152,10 @@ impl Job<'_> {
     }
     /// The order in which rows are stored.
     pub fn order(&self, of: &Integers) -> Vec<usize> {
-        // Rows beside their keys, so that sorting reads no others.
-        let mut rows: Vec<(u8, u64, u32)> = self.layers.0.iter().zip(&of.keys).enumerate().map(|(row, (&layer, &key))| (layer, key, row as u32)).collect();
+        // Layer, key and row in one number, which is compared without branches.
+        let number = |(row, (&layer, &key)): (usize, (&u8, &u64))| u128::from(layer) << 96 | u128::from(key) << 32 | row as u128;
+        let mut rows: Vec<u128> = self.layers.0.par_iter().zip(&of.keys).enumerate().map(number).collect();
         rows.par_sort_unstable();
-        rows.into_iter().map(|(_, _, row)| row as usize).collect()
+        rows.into_par_iter().map(|number| number as u32 as usize).collect()
     }
 }

@@ -4,6 +4,7 @@ use super::entropy::{Coder, LANES, Lanes, behind, symbol_of};
 use super::geometry::checked;
 use cc4dgs_format::Result;
 use cc4dgs_format::archive::ByteReader;
+use rayon::prelude::*;
 
 /// Contexts by expected magnitude, in half octaves.
 const LEVELS: usize = 32;
@@ -117,6 +118,18 @@ impl History {
         out[INPUTS - 1] = CONSTANT;
         out
     }
+    /// The inputs of the component `C` that are not always 0, in the same order.
+    #[inline(always)]
+    fn used_inputs<const C: usize, const K: usize>(&self, row: &[i64; DIMS], known: &Known) -> [f64; K] {
+        let mut out = [0; K];
+        [out[0], out[1]] = self.means(C);
+        out[2..2 + C].copy_from_slice(&row[..C]);
+        out[2 + C..4 + C].copy_from_slice(&known.octaves());
+        // All that are given, or none.
+        out[4 + C..K - 1].copy_from_slice(&known.given[..K - 5 - C]);
+        out[K - 1] = CONSTANT;
+        out.map(|v| v as f64)
+    }
 }
 
 impl Linear {
@@ -126,37 +139,15 @@ impl Linear {
     }
     /// Fits the weights to the rows `codes` `[N,dims]`, where so much is `known` about each. Blocks start where they would in one layer; that layers and lanes
     /// start anew matters little.
-    pub fn fit(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known) -> Self {
-        let mut fitted = vec![[0.0; INPUTS]; dims];
-        let mut spread = [0.0; DIMS];
-        for pass in 0..PASSES {
-            let mut sums = vec![([[0.0f64; INPUTS]; INPUTS], [0.0f64; INPUTS]); dims];
-            let (mut errors, mut history) = ([0.0; DIMS], History::new());
-            for (i, codes) in codes.chunks_exact(dims).enumerate() {
-                if i % super::blocks::ROWS == 0 {
-                    history = History::new();
-                }
-                let (mut row, known) = ([0; DIMS], known(i));
-                for (c, &code) in codes.iter().enumerate() {
-                    let inputs = history.inputs(c, &row, &known).map(|v| v as f64);
-                    row[c] = i64::from(code) << known.shift;
-                    let target = row[c] as f64;
-                    let error = (target - fitted[c].iter().zip(inputs).map(|(w, x)| w * x).sum::<f64>()).abs();
-                    errors[c] += error;
-                    let weight = if pass == 0 { 1.0 } else { 1.0 / (error + spread[c]).max(1e-9) };
-                    let (matrix, vector) = &mut sums[c];
-                    for (a, &x) in inputs.iter().enumerate().filter(|(_, x)| **x != 0.0) {
-                        matrix[a].iter_mut().zip(&inputs).for_each(|(m, y)| *m += weight * x * y);
-                        vector[a] += weight * x * target;
-                    }
-                }
-                history.push(row);
-            }
-            spread = errors.map(|e| 0.5 * e / (codes.len() / dims).max(1) as f64);
-            for ((matrix, vector), fitted) in sums.into_iter().zip(&mut fitted) {
-                *fitted = solve(matrix, vector);
-            }
-        }
+    pub fn fit(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known + Sync) -> Self {
+        // Components do not wait for each other: what predicts one is known of all rows.
+        let component = |c: usize| match (dims, c) {
+            (1, _) => fit_component::<0, { 5 + GIVEN }>(dims, codes, &known),
+            (_, 0) => fit_component::<0, 5>(dims, codes, &known),
+            (_, 1) => fit_component::<1, 6>(dims, codes, &known),
+            _ => fit_component::<2, 7>(dims, codes, &known),
+        };
+        let fitted: Vec<[f64; INPUTS]> = (0..dims).into_par_iter().map(component).collect();
         let round = |w: f64| libm::round(w * f64::from(1u32 << POINT)).clamp(-32767.0, 32767.0) as i16;
         Self { dims, weights: fitted.into_iter().flatten().map(round).collect() }
     }
@@ -249,6 +240,52 @@ impl Linear {
     }
 }
 
+/// The weights of the component `C` of the rows `codes` `[N,dims]`. Of its inputs `K` are not always 0: the numbers given are where there is room for them.
+fn fit_component<const C: usize, const K: usize>(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known) -> [f64; INPUTS] {
+    let (mut weights, mut spread) = ([0.0; INPUTS], 0.0);
+    for pass in 0..PASSES {
+        let fitted: [f64; K] = std::array::from_fn(|k| weights[input_of::<C, K>(k)]);
+        let (mut sums, mut targets, mut errors) = ([[0.0f64; K]; K], [0.0f64; K], 0.0);
+        let mut history = History::new();
+        for (i, codes) in codes.chunks_exact(dims).enumerate() {
+            if i % super::blocks::ROWS == 0 {
+                history = History::new();
+            }
+            let (mut row, known) = ([0; DIMS], known(i));
+            row.iter_mut().zip(codes).for_each(|(row, &code)| *row = i64::from(code) << known.shift);
+            let (inputs, target) = (history.used_inputs::<C, K>(&row, &known), row[C] as f64);
+            let error = (target - fitted.iter().zip(inputs).map(|(w, x)| w * x).sum::<f64>()).abs();
+            errors += error;
+            let weight = if pass == 0 { 1.0 } else { 1.0 / (error + spread).max(1e-9) };
+            for (k, (sums, x)) in sums.iter_mut().zip(inputs).enumerate() {
+                sums.iter_mut().zip(inputs).for_each(|(sum, y)| *sum += weight * x * y);
+                targets[k] += weight * x * target;
+            }
+            history.push(row);
+        }
+        spread = 0.5 * errors / (codes.len() / dims).max(1) as f64;
+        let (mut matrix, mut vector) = ([[0.0; INPUTS]; INPUTS], [0.0; INPUTS]);
+        for (k, (sums, target)) in sums.iter().zip(targets).enumerate() {
+            let input = input_of::<C, K>(k);
+            vector[input] = target;
+            sums.iter().enumerate().for_each(|(other, sum)| matrix[input][input_of::<C, K>(other)] = *sum);
+        }
+        weights = solve(matrix, vector);
+    }
+    weights
+}
+
+/// Which of all inputs the used input `k` of the component `C` is.
+const fn input_of<const C: usize, const K: usize>(k: usize) -> usize {
+    if k + 1 == K {
+        INPUTS - 1
+    } else if k < 2 + C {
+        k
+    } else {
+        k + DIMS - C
+    }
+}
+
 fn rounded(value: i64, shift: u32) -> i64 {
     if shift == 0 { value } else { (value + (1 << (shift - 1))) >> shift }
 }
@@ -303,5 +340,49 @@ mod tests {
         let mut found = vec![0; codes.len()];
         linear.code(&mut decoder, &mut found, &known).unwrap();
         assert_eq!(found, codes);
+    }
+
+    #[test]
+    fn inputs_that_are_always_zero_change_no_weight() {
+        // All sums of all inputs, row after row.
+        let plain = |dims: usize, codes: &[i32], known: &[Known]| -> Vec<i16> {
+            let (mut fitted, mut spread) = (vec![[0.0; INPUTS]; dims], [0.0; DIMS]);
+            for pass in 0..PASSES {
+                let mut sums = vec![([[0.0f64; INPUTS]; INPUTS], [0.0f64; INPUTS]); dims];
+                let (mut errors, mut history) = ([0.0; DIMS], History::new());
+                for (codes, known) in codes.chunks_exact(dims).zip(known) {
+                    let mut row = [0; DIMS];
+                    for (c, &code) in codes.iter().enumerate() {
+                        let inputs = history.inputs(c, &row, known).map(|v| v as f64);
+                        row[c] = i64::from(code) << known.shift;
+                        let target = row[c] as f64;
+                        let error = (target - fitted[c].iter().zip(inputs).map(|(w, x)| w * x).sum::<f64>()).abs();
+                        errors[c] += error;
+                        let weight = if pass == 0 { 1.0 } else { 1.0 / (error + spread[c]).max(1e-9) };
+                        let (matrix, vector) = &mut sums[c];
+                        for (a, &x) in inputs.iter().enumerate().filter(|(_, x)| **x != 0.0) {
+                            matrix[a].iter_mut().zip(&inputs).for_each(|(m, y)| *m += weight * x * y);
+                            vector[a] += weight * x * target;
+                        }
+                    }
+                    history.push(row);
+                }
+                spread = errors.map(|e| 0.5 * e / known.len() as f64);
+                sums.into_iter().zip(&mut fitted).for_each(|((matrix, vector), fitted)| *fitted = solve(matrix, vector));
+            }
+            let round = |w: f64| libm::round(w * f64::from(1u32 << POINT)).clamp(-32767.0, 32767.0) as i16;
+            fitted.into_iter().flatten().map(round).collect()
+        };
+        for dims in [1, DIMS] {
+            let given = |i: i64| if dims == 1 { [i * i % 977 - 400, i % 13, 0] } else { [0; GIVEN] };
+            let classes = |i: i64| [(i * 5 % 9) as u8, (i * i % 7) as u8];
+            let row = |i: i64| Known { classes: classes(i), class: classes(i)[0], shift: (i % 4) as u8, given: given(i) };
+            let known: Vec<Known> = (0..2000).map(row).collect();
+            let code = |k: i32| (60.0 * (f64::from(k) * 0.013).sin()) as i32 / (1 + k % 3) + k * k % 31;
+            let codes: Vec<i32> = (0..2000 * dims as i32).map(code).collect();
+            let weights = Linear::fit(dims, &codes, |i| known[i]).weights;
+            assert_eq!(weights, plain(dims, &codes, &known), "{dims} components");
+            assert!(weights.chunks_exact(INPUTS).all(|weights| weights.iter().any(|w| *w != 0)), "{weights:?}");
+        }
     }
 }

@@ -137,13 +137,21 @@ impl Integers<'_> {
         });
     }
     /// The `loss` of the higher degrees, which are restored block by block.
-    fn rest_loss(&self, given: &[f32], mut loss: PartialLoss) -> f64 {
-        let size = ROWS * self.plan.degrees.iter().skip(1).map(|plan| plan.dims).sum::<usize>();
-        let mut block = vec![0.0; size.min(given.len())];
-        for (k, values) in given.chunks(size.max(1)).enumerate() {
-            let restored = &mut block[..values.len()];
-            self.rest(given, |index| k * ROWS + index, restored);
-            loss.add(values, restored);
+    fn rest_loss(&self, given: &[f32], loss: PartialLoss) -> f64 {
+        self.loss_by_blocks(given, loss, ROWS)
+    }
+    /// The same with blocks of so many `rows`. A block is restored while that before it is added up, one value after the other.
+    fn loss_by_blocks(&self, given: &[f32], mut loss: PartialLoss, rows: usize) -> f64 {
+        let size = (rows * self.plan.degrees.iter().skip(1).map(|plan| plan.dims).sum::<usize>()).max(1);
+        let restore = |k: usize, block: &mut Vec<f32>| {
+            block.resize(size.min(given.len().saturating_sub(k * size)), 0.0);
+            self.rest(given, |index| k * rows + index, block);
+        };
+        let (mut block, mut next) = (Vec::new(), Vec::new());
+        restore(0, &mut block);
+        for (k, values) in given.chunks(size).enumerate() {
+            rayon::join(|| loss.add(values, &block), || restore(k + 1, &mut next));
+            std::mem::swap(&mut block, &mut next);
         }
         loss.loss()
     }
@@ -184,6 +192,9 @@ mod tests {
         let found = losses(&of, columns, &planner.losses, [None; 6]);
         for (((name, width, given), (_, _, decoded)), lost) in g.columns().into_iter().zip(whole.columns()).zip(&found) {
             assert!(*lost > 0.0 && lost.to_bits() == column_loss(name, given, decoded, width).to_bits(), "{name}: {lost}");
+        }
+        for rows in [1, 7, 299, 300, 301] {
+            assert_eq!(of.loss_by_blocks(&g.sh_rest, planner.losses.rest, rows).to_bits(), found[5].to_bits(), "blocks of {rows}");
         }
         let known = [None, None, None, None, Some(0.25), Some(0.5)];
         assert_eq!(losses(&of, columns, &planner.losses, known), [&found[..4], &[0.25, 0.5][..]].concat());

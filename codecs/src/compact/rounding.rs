@@ -101,7 +101,7 @@ impl Rounder<'_> {
     /// The predictions of `codes`, whose rows are coded in `order`.
     fn guesses(&self, codes: &Integers, order: &[usize]) -> Guesses {
         let (geometry, classes) = (&self.plan.geometry, self.classes);
-        let guesses = |dims: usize, values: &[i32], known: &dyn Fn(usize) -> Known| {
+        let guesses = |dims: usize, values: &[i32], known: &(dyn Fn(usize) -> Known + Sync)| {
             let sorted: Vec<i32> = order.iter().flat_map(|&i| &values[i * dims..(i + 1) * dims]).copied().collect();
             let known = |row: usize| known(order[row]);
             let found = Linear::fit(dims, &sorted, known).guesses(&sorted, known);

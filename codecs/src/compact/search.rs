@@ -49,7 +49,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             let chosen = of.len().min(budget(WORK, gaussians.len(), VIEWS));
             if by_drop {
                 let recorded = Recorded::of(judges, renderer, chosen)?;
-                Allowance::Drop { before: recorded.psnr(whole)?, limit: settings.max_drop_db, recorded }
+                Allowance::Drop { before: recorded.psnr(whole.clone())?, limit: settings.max_drop_db, recorded }
             } else {
                 let images = Images::of(whole, views, renderer, chosen)?;
                 if images.show_nothing(renderer.background()) {

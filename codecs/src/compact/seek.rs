@@ -44,12 +44,12 @@ impl Allowance<'_> {
             }
             Self::Drop { before, limit, recorded } => {
                 let (attempt, rounded) = job.attempt(quality)?;
-                let share = (before - recorded.psnr(&rounded)?) / limit;
+                let share = (before - recorded.psnr(rounded)?) / limit;
                 Ok(Tried { attempt, share, streams: None, ended: None })
             }
             Self::Difference { limit, images, .. } => {
                 let (attempt, rounded) = job.attempt(quality)?;
-                Ok(Tried { attempt, share: images.mean_squared_error(&rounded)? / limit, streams: None, ended: None })
+                Ok(Tried { attempt, share: images.mean_squared_error(rounded)? / limit, streams: None, ended: None })
             }
         }
     }

@@ -89,7 +89,7 @@ pub fn measure(gaussians: Columns, classes: &Classes, context: &CodecContext, qu
                     sum += (by / unit).powi(2);
                 }
             }
-            let squared = images.error(&changed)? / (images.len() as f64 * sum);
+            let squared = images.error(changed)? / (images.len() as f64 * sum);
             Ok(if squared.is_finite() { squared.sqrt() } else { 0.0 })
         };
         let mut best: Option<(f64, Sensitivity, Vec<f64>)> = None;

@@ -92,6 +92,13 @@ pub trait RenderModel {
     fn render_views(&self, gaussians: &HostGaussians, views: &[(&Camera, f32)], take: &mut dyn FnMut(usize, RenderedPlanes) -> Result<()>) -> Result<()> {
         views.iter().enumerate().try_for_each(|(index, &(camera, time_norm))| take(index, self.render(gaussians, camera, time_norm)?))
     }
+    /// [`RenderModel::render_views`] of `gaussians` that are not needed any more, so that a renderer need not copy them.
+    ///
+    /// # Errors
+    /// As [`RenderModel::render_views`].
+    fn render_views_once(&self, gaussians: HostGaussians, views: &[(&Camera, f32)], take: &mut dyn FnMut(usize, RenderedPlanes) -> Result<()>) -> Result<()> {
+        self.render_views(&gaussians, views, take)
+    }
     /// The colour behind everything, RGB in 0..1.
     fn background(&self) -> [f32; 3];
     /// An unbiased estimate, for every value of every column, of the sum over pixels and channels of the squared derivative of the image by that value as it is

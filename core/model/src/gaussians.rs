@@ -33,19 +33,23 @@ pub struct Gaussians {
 impl Gaussians {
     /// Uploads plain arrays to `device`.
     pub fn from_host(host: &HostGaussians, device: &Device) -> Self {
+        Self::of_host(host.clone(), device)
+    }
+    /// [`Gaussians::from_host`] of arrays that are not needed any more: on processors they become the tensors without a copy.
+    pub fn of_host(host: HostGaussians, device: &Device) -> Self {
         let n = host.len();
-        let two = |values: &Vec<f32>, width: usize| Tensor::<2>::from_data(TensorData::new(values.clone(), [n, width]), device);
-        let one = |values: &Vec<f32>| Tensor::<1>::from_data(TensorData::new(values.clone(), [n]), device);
+        let two = |values: Vec<f32>, width: usize| Tensor::<2>::from_data(TensorData::new(values, [n, width]), device);
+        let one = |values: Vec<f32>| Tensor::<1>::from_data(TensorData::new(values, [n]), device);
         Self {
             sh_degree: host.sh_degree,
-            means: two(&host.means, 3),
-            log_scales: two(&host.log_scales, 3),
-            quaternions: two(&host.quaternions, 4),
-            opacity_logits: one(&host.opacity_logits),
-            sh_dc: two(&host.sh_dc, 3),
-            sh_rest: Tensor::<3>::from_data(TensorData::new(host.sh_rest.clone(), [n, sh_rest_len(host.sh_degree), 3]), device),
-            dynamic_scores: one(&host.dynamic_scores),
-            extra: host.extra.iter().map(|(name, a)| (name.clone(), two(&a.values, a.width))).collect(),
+            means: two(host.means, 3),
+            log_scales: two(host.log_scales, 3),
+            quaternions: two(host.quaternions, 4),
+            opacity_logits: one(host.opacity_logits),
+            sh_dc: two(host.sh_dc, 3),
+            sh_rest: Tensor::<3>::from_data(TensorData::new(host.sh_rest, [n, sh_rest_len(host.sh_degree), 3]), device),
+            dynamic_scores: one(host.dynamic_scores),
+            extra: host.extra.into_iter().map(|(name, a)| (name, two(a.values, a.width))).collect(),
         }
     }
     /// Reads the tensors back into plain arrays.
@@ -138,11 +142,11 @@ pub fn first_rows<const D: usize>(values: Tensor<D>, count: usize) -> Tensor<D> 
     values.reshape([all]).narrow(0, 0, some).reshape(dims)
 }
 
-/// Reads a float tensor back, row-major; `object` names it in errors.
+/// Reads a float tensor back, row-major; `object` names it in errors. On processors the values of a tensor with no other owner are not copied.
 ///
 /// # Errors
 /// [`Error::Backend`] if the device fails.
 pub fn to_vec<const D: usize>(tensor: Tensor<D>, object: &str) -> Result<Vec<f32>> {
     let failed = |problem: String| Error::backend(object, format!("reading the tensor back failed: {problem}"), "Try another device (--device flex)");
-    tensor.try_into_data().map_err(|e| failed(format!("{e:?}")))?.try_to_vec::<f32>().map_err(|e| failed(format!("{e:?}")))
+    tensor.try_into_data().map_err(|e| failed(format!("{e:?}")))?.try_into_vec::<f32>().map_err(|e| failed(format!("{e:?}")))
 }

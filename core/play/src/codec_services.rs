@@ -81,13 +81,13 @@ impl<'a> ModelServices<'a> {
         Ok(self.rasterizer.render(&Splats::from_gaussians(&moved, moved.sh_degree), camera, &self.settings)?.image())
     }
     fn moved(&self, host: &HostGaussians, time_norm: f32) -> Result<Gaussians> {
-        self.unmoved(host)?.at(time_norm)
+        self.unmoved(host.clone())?.at(time_norm)
     }
     /// What all times share.
-    fn unmoved(&self, host: &HostGaussians) -> Result<Unmoved<'_>> {
-        let canonical = Gaussians::from_host(host, &self.device);
+    fn unmoved(&self, host: HostGaussians) -> Result<Unmoved<'_>> {
         let rows = self.model.moving.rows(&host.dynamic_scores);
         let nothing_moves = host.is_empty() || rows.as_ref().is_some_and(Vec::is_empty);
+        let canonical = Gaussians::of_host(host, &self.device);
         let Some(deformer) = self.deformer.filter(|d| !nothing_moves && !d.is_static()) else { return Ok(Unmoved { canonical, motion: None }) };
         let rows = rows.map(|rows| {
             let indices: Vec<i64> = rows.iter().map(|&row| row as i64).collect();
@@ -98,10 +98,6 @@ impl<'a> ModelServices<'a> {
         let features = deformer.spatial(&SpatialInput { means_world: select(&canonical.means), attributes })?.values;
         let name = self.model.field.as_ref().map_or("", |f| f.name());
         Ok(Unmoved { canonical, motion: Some(Motion { deformer, name, features, rows }) })
-    }
-    fn drawn(&self, moved: &Gaussians, camera: &Camera) -> Result<RenderedPlanes> {
-        let output = self.rasterizer.render(&Splats::from_gaussians(moved, moved.sh_degree), camera, &self.settings)?;
-        Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
     }
     /// The estimate of [`RenderModel::squared_derivatives`] for Gaussians as they are drawn.
     fn squares(&self, mut moved: Gaussians, camera: &Camera, seed: Seed) -> Result<HostGaussians> {
@@ -129,7 +125,7 @@ impl<'a> ModelServices<'a> {
         let planes = self.rasterizer.render(&splats, camera, &RenderSettings { background, ..self.settings.clone() })?.image();
         let shape = planes.dims();
         let signs = rand_signs(seed, shape.iter().product());
-        let gradients = (planes * Tensor::<3>::from_data(TensorData::new(signs, shape), &tracked)).sum().backward();
+        let mut gradients = (planes * Tensor::<3>::from_data(TensorData::new(signs, shape), &tracked)).sum().backward();
         fn squared<const D: usize>(gradient: Option<Tensor<D>>, count: usize, name: &str) -> Result<Vec<f32>> {
             // A tensor that no pixel depends on has no gradient.
             let Some(gradient) = gradient else { return Ok(vec![0.0; count]) };
@@ -137,18 +133,38 @@ impl<'a> ModelServices<'a> {
             values.par_iter_mut().for_each(|v| *v = if v.is_finite() { *v * *v } else { 0.0 });
             Ok(values)
         }
+        // Derivatives are taken out: what has no other owner is not copied.
         Ok(HostGaussians {
             sh_degree: moved.sh_degree,
-            means: squared(means.grad(&gradients), 3 * n, "derivatives by centres")?,
-            log_scales: squared(log_scales.grad(&gradients), 3 * n, "derivatives by scales")?,
-            quaternions: squared(quaternions.grad(&gradients), 4 * n, "derivatives by rotations")?,
-            opacity_logits: squared(opacity_logits.grad(&gradients), n, "derivatives by opacities")?,
-            sh_dc: squared(sh_dc.grad(&gradients), 3 * n, "derivatives by colours")?,
-            sh_rest: squared(sh_rest.grad(&gradients), 3 * n * coefficients, "derivatives by colours")?,
+            means: squared(means.grad_remove(&mut gradients), 3 * n, "derivatives by centres")?,
+            log_scales: squared(log_scales.grad_remove(&mut gradients), 3 * n, "derivatives by scales")?,
+            quaternions: squared(quaternions.grad_remove(&mut gradients), 4 * n, "derivatives by rotations")?,
+            opacity_logits: squared(opacity_logits.grad_remove(&mut gradients), n, "derivatives by opacities")?,
+            sh_dc: squared(sh_dc.grad_remove(&mut gradients), 3 * n, "derivatives by colours")?,
+            sh_rest: squared(sh_rest.grad_remove(&mut gradients), 3 * n * coefficients, "derivatives by colours")?,
             dynamic_scores: vec![0.0; n],
             extra: Default::default(),
         })
     }
+}
+
+/// Views that are drawn at a time where this process's threads draw: parts of each, such as sorting, are work for one thread. More views take more memory.
+const TOGETHER: usize = 2;
+
+/// Whether Gaussians on `device` are drawn by the threads of this process.
+#[cfg(feature = "cpu")]
+fn draws_in_threads(device: &Device) -> bool {
+    matches!(device.as_dispatch(), burn::backend::DispatchDevice::Flex(_))
+}
+
+#[cfg(not(feature = "cpu"))]
+fn draws_in_threads(_: &Device) -> bool {
+    false
+}
+
+fn drawn(rasterizer: &dyn Rasterizer, settings: &RenderSettings, moved: &Gaussians, camera: &Camera) -> Result<RenderedPlanes> {
+    let output = rasterizer.render(&Splats::from_gaussians(moved, moved.sh_degree), camera, settings)?;
+    Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
 }
 
 /// Canonical Gaussians on the device, and how they move, if they do.
@@ -180,11 +196,23 @@ impl EvaluateDeformer for ModelServices<'_> {
 
 impl RenderModel for ModelServices<'_> {
     fn render(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes> {
-        self.drawn(&self.moved(gaussians, time_norm)?, camera)
+        drawn(self.rasterizer.as_ref(), &self.settings, &self.moved(gaussians, time_norm)?, camera)
     }
     fn render_views(&self, gaussians: &HostGaussians, views: &[(&Camera, f32)], take: &mut dyn FnMut(usize, RenderedPlanes) -> Result<()>) -> Result<()> {
+        self.render_views_once(gaussians.clone(), views, take)
+    }
+    fn render_views_once(&self, gaussians: HostGaussians, views: &[(&Camera, f32)], take: &mut dyn FnMut(usize, RenderedPlanes) -> Result<()>) -> Result<()> {
         let unmoved = self.unmoved(gaussians)?;
-        views.iter().enumerate().try_for_each(|(index, &(camera, time_norm))| take(index, self.drawn(&unmoved.at(time_norm)?, camera)?))
+        let together = if draws_in_threads(&self.device) { TOGETHER } else { 1 };
+        let (rasterizer, settings) = (self.rasterizer.as_ref(), &self.settings);
+        for (k, views) in views.chunks(together).enumerate() {
+            let moved = views.iter().map(|(_, time_norm)| unmoved.at(*time_norm)).collect::<Result<Vec<Gaussians>>>()?;
+            let draw = |((camera, _), moved): (&(&Camera, f32), &Gaussians)| drawn(rasterizer, settings, moved, camera);
+            let images: Vec<Result<RenderedPlanes>> =
+                if views.len() > 1 { views.par_iter().zip(&moved).map(draw).collect() } else { views.iter().zip(&moved).map(draw).collect() };
+            images.into_iter().enumerate().try_for_each(|(index, image)| take(k * together + index, image?))?;
+        }
+        Ok(())
     }
     fn background(&self) -> [f32; 3] {
         self.model.background_on(None)
@@ -199,7 +227,7 @@ impl RenderModel for ModelServices<'_> {
         seed: Seed,
         take: &mut dyn FnMut(usize, HostGaussians, Option<Vec<f32>>) -> Result<()>,
     ) -> Result<bool> {
-        let unmoved = self.unmoved(gaussians)?;
+        let unmoved = self.unmoved(gaussians.clone())?;
         for (index, &(camera, time_norm)) in views.iter().enumerate() {
             let moved = unmoved.at(time_norm)?;
             let means = to_vec(moved.means.clone(), "centres")?;
