@@ -24,14 +24,19 @@ features = 4             # features per level
 base = 16                # vertices per axis of the first level; each level doubles them
 width = 128              # width of encoder and heads
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
-lr_start = 2e-4          # Adam, times the extent of the cameras in the normalised frame, log-linear to lr_end
+lr_start = 2e-4          # Adam, log-linear to lr_end
 lr_end = 2e-6
+grid_rate = 1.0          # learning rate of the table, as a multiple
+times_extent = true      # multiply the rates by the extent of the cameras in the normalised frame, as published
 "#;
 
 /// Heads are padded to this many columns, as the published weights are.
 const PADDED: usize = 16;
 /// Initial table entries are uniform in ± this.
 const TABLE: f32 = 1e-4;
+/// Parameter groups by index.
+const NET: usize = 0;
+const GRID: usize = 1;
 
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -44,12 +49,14 @@ struct Settings {
     heads: Vec<Head>,
     lr_start: f64,
     lr_end: f64,
+    grid_rate: f64,
+    times_extent: bool,
 }
 
 impl Default for Settings {
     fn default() -> Self {
         let heads = vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh];
-        Self { log2_rows: 15, levels: 16, features: 4, base: 16, width: 128, heads, lr_start: 2e-4, lr_end: 2e-6 }
+        Self { log2_rows: 15, levels: 16, features: 4, base: 16, width: 128, heads, lr_start: 2e-4, lr_end: 2e-6, grid_rate: 1.0, times_extent: true }
     }
 }
 
@@ -70,7 +77,7 @@ impl Swift4d {
         within("base", settings.base as usize, 2, 256)?;
         within("width", settings.width, 1, 4096)?;
         heads::check(&settings.heads)?;
-        not_negative(&[("lr_start", settings.lr_start), ("lr_end", settings.lr_end)])?;
+        not_negative(&[("lr_start", settings.lr_start), ("lr_end", settings.lr_end), ("grid_rate", settings.grid_rate)])?;
         let mut grid =
             GridShape { dims: 4, features: settings.features, levels: Vec::new(), stagger: 0.5, smooth: false, clamps: false, outside: Outside::Zero };
         for level in 0..settings.levels {
@@ -86,12 +93,12 @@ impl Swift4d {
             widths.windows(2).enumerate().flat_map(|(i, pair)| weights::glorot(seed.index(i as u64), pair[0], pair[1])).collect()
         };
         let table = weights::uniform(seed.child("table"), grid.parameter_count(), TABLE);
-        let mut parameters = vec![parameter("grid.table".into(), Part::Grid, 0, table, device)];
+        let mut parameters = vec![parameter("grid.table".into(), Part::Grid, GRID, table, device)];
         // The paper's size tables count the encoder as grid.
-        parameters.push(parameter("grid.encoder".into(), Part::Grid, 0, matrices(seed.child("encoder"), &[grid.width(), w, w]), device));
+        parameters.push(parameter("grid.encoder".into(), Part::Grid, NET, matrices(seed.child("encoder"), &[grid.width(), w, w]), device));
         for (head, &out) in settings.heads.iter().zip(&outputs) {
             let values = matrices(seed.child(head.name()), &[w, w, w, out]);
-            parameters.push(parameter(format!("net.head.{}", head.name()), Part::Net, 0, values, device));
+            parameters.push(parameter(format!("net.head.{}", head.name()), Part::Net, NET, values, device));
         }
         Ok(Self { settings, context: context.clone(), grid: Arc::new(grid), network: Arc::new(network), parameters })
     }
@@ -129,8 +136,13 @@ impl Deformer for Swift4d {
         self.parameters.iter_mut().collect()
     }
     fn groups(&self) -> Vec<ParameterGroup> {
-        let group = ParameterGroup::plain("swift4d-hash", self.settings.lr_start, self.settings.lr_end);
-        vec![ParameterGroup { times_extent: true, epsilon: 1e-8, ..group }]
+        let s = &self.settings;
+        let group = |name, factor| ParameterGroup {
+            times_extent: s.times_extent,
+            epsilon: 1e-8,
+            ..ParameterGroup::plain(name, s.lr_start * factor, s.lr_end * factor)
+        };
+        vec![group("swift4d-hash", 1.0), group("swift4d-hash table", s.grid_rate)]
     }
 }
 
@@ -149,5 +161,27 @@ inventory::submit! {
             capabilities: &["differentiable", "joint-space-time"],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Seed;
+
+    #[test]
+    fn the_table_has_a_rate_of_its_own_and_the_extent_may_be_left_out() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let of = |grid_rate: f64, times_extent: bool| {
+            let small = Settings { log2_rows: 4, levels: 1, width: 4, grid_rate, times_extent, ..Settings::default() };
+            let deformer = Swift4d::new(small, &context, &Device::flex()).unwrap();
+            let groups = deformer.groups();
+            let rate = |parameter: &Parameter| (groups[parameter.group].lr_start, groups[parameter.group].lr_end, groups[parameter.group].times_extent);
+            deformer.parameters().into_iter().map(rate).collect::<Vec<_>>()
+        };
+        assert!(of(1.0, true).into_iter().all(|rate| rate == (2e-4, 2e-6, true)), "as published");
+        let own = of(3.0, false);
+        assert_eq!(own[0], (2e-4 * 3.0, 2e-6 * 3.0, false));
+        assert!(own[1..].iter().all(|rate| *rate == (2e-4, 2e-6, false)));
     }
 }

@@ -117,7 +117,7 @@ impl Codes {
 
 /// The rows that are not `coded`.
 pub fn missing(coded: &[bool]) -> Vec<usize> {
-    // Nearly always none is missing, which vectors see faster than a loop that may end.
+    // Nearly always none is missing. A fold that reads all rows is vectorised; `all`, which stops early, is not.
     if coded.iter().fold(true, |all, coded| all & coded) {
         return Vec::new();
     }
@@ -165,7 +165,7 @@ impl Degree {
         let step = self.step_of(class);
         let steps = project_all::<DIMS>(columns, row, &self.mean).map(|coordinate| coordinate / step);
         if rate_weight == 0.0 {
-            // All together: what is out of range is rare.
+            // All are compared before one is rounded, so that neither loop stops early and both are vectorised. Few rows are out of range.
             let in_range = steps.iter().fold(true, |all, steps| all & (steps.abs() < NEAREST_LIMIT));
             if in_range {
                 codes.iter_mut().zip(steps).for_each(|(code, steps)| *code = nearest(steps));

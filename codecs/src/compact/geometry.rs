@@ -155,8 +155,8 @@ impl Geometry {
     }
 }
 
-/// The integer nearest to a number whose magnitude is below 2^31; of two, the one farther from zero, as of [`f64::round`]. It has no branches, which would wait
-/// for values that cannot be foreseen, and calls nothing.
+/// The integer nearest to a number whose magnitude is below 2^31 - 0.5; of two, the one farther from zero, as of [`f64::round`]. It has no branches, which
+/// would be mispredicted, and calls no function, so that loops of it are vectorised.
 #[inline(always)]
 pub fn nearest(value: f64) -> i32 {
     /// Neighbours of numbers of this size are 1 apart.

@@ -35,7 +35,7 @@ pub struct Known {
     pub class: u8,
     /// The shift of the steps of what is coded.
     pub shift: u8,
-    /// Numbers in the steps of class 0; [`Linear::code`] reads them in rows of one component.
+    /// Numbers in the steps of class 0, which predict rows of one component; [`Linear::fit`] and [`Linear::code`] ignore them in others.
     pub given: [i64; GIVEN],
 }
 
@@ -118,14 +118,14 @@ impl History {
         out[INPUTS - 1] = CONSTANT;
         out
     }
-    /// The inputs of the component `C` that are not always 0, in the same order.
+    /// The `K` inputs of the component `C` that can differ from 0, in the same order: the numbers given are among them if `K` has room for them.
     #[inline(always)]
     fn used_inputs<const C: usize, const K: usize>(&self, row: &[i64; DIMS], known: &Known) -> [f64; K] {
         let mut out = [0; K];
         [out[0], out[1]] = self.means(C);
         out[2..2 + C].copy_from_slice(&row[..C]);
         out[2 + C..4 + C].copy_from_slice(&known.octaves());
-        // All that are given, or none.
+        // All numbers given, or none of them.
         out[4 + C..K - 1].copy_from_slice(&known.given[..K - 5 - C]);
         out[K - 1] = CONSTANT;
         out.map(|v| v as f64)
@@ -140,7 +140,7 @@ impl Linear {
     /// Fits the weights to the rows `codes` `[N,dims]`, where so much is `known` about each. Blocks start where they would in one layer; that layers and lanes
     /// start anew matters little.
     pub fn fit(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known + Sync) -> Self {
-        // Components do not wait for each other: what predicts one is known of all rows.
+        // Components are fitted in parallel: the codes of all of them are known.
         let component = |c: usize| match (dims, c) {
             (1, _) => fit_component::<0, { 5 + GIVEN }>(dims, codes, &known),
             (_, 0) => fit_component::<0, 5>(dims, codes, &known),
@@ -240,7 +240,7 @@ impl Linear {
     }
 }
 
-/// The weights of the component `C` of the rows `codes` `[N,dims]`. Of its inputs `K` are not always 0: the numbers given are where there is room for them.
+/// The weights of the component `C` of the rows `codes` `[N,dims]`, fitted to its [`History::used_inputs`]; those of the other inputs are 0.
 fn fit_component<const C: usize, const K: usize>(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known) -> [f64; INPUTS] {
     let (mut weights, mut spread) = ([0.0; INPUTS], 0.0);
     for pass in 0..PASSES {

@@ -148,7 +148,8 @@ impl<'a> ModelServices<'a> {
     }
 }
 
-/// Views that are drawn at a time where this process's threads draw: parts of each, such as sorting, are work for one thread. More views take more memory.
+/// Views that are drawn at a time where threads of this process draw: while one thread works on a serial part of a view, such as sorting, others draw another.
+/// Every further view takes memory for its moved Gaussians and its tile lists.
 const TOGETHER: usize = 2;
 
 /// Whether Gaussians on `device` are drawn by the threads of this process.
@@ -162,6 +163,7 @@ fn draws_in_threads(_: &Device) -> bool {
     false
 }
 
+/// The planes of `moved` in `camera`. No method of [`ModelServices`], which threads cannot share.
 fn drawn(rasterizer: &dyn Rasterizer, settings: &RenderSettings, moved: &Gaussians, camera: &Camera) -> Result<RenderedPlanes> {
     let output = rasterizer.render(&Splats::from_gaussians(moved, moved.sh_degree), camera, settings)?;
     Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
