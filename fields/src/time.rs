@@ -20,6 +20,16 @@ pub fn encode(time_norm: f32, bands: usize) -> Vec<f32> {
     out
 }
 
+/// [`encode`] with bands of 1, 2, 4… times `cycles` cycles per sequence, whose amplitude is 2^-`falloff` times that of the next lower one. t stays t.
+pub fn encode_scaled(time_norm: f32, bands: usize, cycles: f32, falloff: f32) -> Vec<f32> {
+    let mut encoding = encode(time_norm * cycles, bands);
+    encoding[0] = time_norm;
+    for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
+        pair.iter_mut().for_each(|v| *v *= (-falloff * band as f32).exp2());
+    }
+    encoding
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -40,5 +50,16 @@ mod tests {
             assert!((f64::from(got[2 * l - 1]) - angle.sin()).abs() < 1e-6 && (f64::from(got[2 * l]) - angle.cos()).abs() < 1e-6);
         }
         assert_eq!(encode(0.0, 2), [0.0, 0.0, 1.0, 0.0, 1.0]);
+    }
+
+    #[test]
+    fn one_cycle_without_falloff_is_the_papers_to_the_bit() {
+        assert_eq!(encode_scaled(0.3, 8, 1.0, 0.0), encode(0.3, 8));
+        let (half, of_half) = (encode_scaled(0.3, 3, 0.5, 1.0), encode(0.15, 3));
+        assert_eq!((half.len(), half[0]), (7, 0.3));
+        for (k, (got, plain)) in half.iter().zip(&of_half).skip(1).enumerate() {
+            let octave = (k / 2) as f32;
+            assert!((got - plain * (-octave).exp2()).abs() < 1e-6, "{half:?}");
+        }
     }
 }

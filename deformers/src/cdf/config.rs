@@ -4,7 +4,7 @@ use crate::parts::heads::{self, Head};
 use crate::parts::settings::{Rates, bounded, refuse_unknown, take, within};
 use crate::parts::voxels::{VoxelSettings, VoxelSizes};
 use cc4dgs_backends::ops::field::ReluShape;
-use cc4dgs_core::{DeformerContext, Result, config};
+use cc4dgs_core::{DeformerContext, Error, Result, config};
 use cc4dgs_fields::time::bands_for;
 use serde::{Deserialize, Deserializer};
 
@@ -19,6 +19,8 @@ hashes = 128             # hash functions per vertex
 modulus = 1000000        # m of the hash functions
 time_encoding = "frequency"   # frequency | raw
 time_bands = 0           # frequency bands; 0 chooses by the number of frames
+cycles = 1.0             # cycles of the lowest band over the sequence; with whole cycles, only t tells the last frame from the first
+falloff = 0.0            # amplitude of a band over the next lower one is 2^-falloff: fast motion is learned later; 0 treats all alike (the paper)
 time_layers = 3          # hidden layers of the time network
 fusion = "film"          # film | concat
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
@@ -85,6 +87,10 @@ pub struct NetworkSettings {
     pub time_encoding: TimeEncoding,
     /// Frequency bands; 0 chooses by the number of frames.
     pub time_bands: usize,
+    /// Cycles of the lowest band over the sequence.
+    pub cycles: f32,
+    /// The amplitude of each band is 2^-falloff times that of the next lower one.
+    pub falloff: f32,
     /// Hidden layers of the time network.
     pub time_layers: usize,
     /// How time features and spatial features are combined.
@@ -97,7 +103,7 @@ pub struct NetworkSettings {
 
 impl NetworkSettings {
     /// The keys of these settings in a `[deformer]` section.
-    pub const KEYS: [&'static str; 7] = ["width", "time_encoding", "time_bands", "time_layers", "fusion", "heads", "cache"];
+    pub const KEYS: [&'static str; 9] = ["width", "time_encoding", "time_bands", "cycles", "falloff", "time_layers", "fusion", "heads", "cache"];
 }
 
 impl Default for NetworkSettings {
@@ -106,6 +112,8 @@ impl Default for NetworkSettings {
             width: None,
             time_encoding: TimeEncoding::Frequency,
             time_bands: 0,
+            cycles: 1.0,
+            falloff: 0.0,
             time_layers: 3,
             fusion: Fusion::Film,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
@@ -153,6 +161,12 @@ impl CdfConfig {
         within("width", width, 1, 4096)?;
         within("time_layers", network.time_layers, 1, 16)?;
         within("time_bands", network.time_bands, 0, 24)?;
+        if !(0.1..=16.0).contains(&network.cycles) {
+            return Err(Error::parameter("deformer.cycles", format!("{} cannot be used", network.cycles), "Give 0.1 to 16; 0.5 and 1 are usual"));
+        }
+        if !(0.0..=4.0).contains(&network.falloff) {
+            return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", network.falloff), "Give 0 (none) to 4"));
+        }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
         heads::check(&network.heads)?;
         self.rates.check()?;

@@ -78,7 +78,8 @@ impl Formulas<'_> {
         let device = self.weight("net.time")?.device();
         let voxel = self.voxels(&means_world.inner(), &device)?;
         let (m, w) = (voxel.dims()[0], sizes.width);
-        let encoding = time::encode(time_norm, sizes.time_bands);
+        let network = &self.0.config.network;
+        let encoding = time::encode_scaled(time_norm, sizes.time_bands, network.cycles, network.falloff);
         let inputs = encoding.len();
         let widths: Vec<usize> = std::iter::once(inputs).chain(sizes.time.trunk.iter().copied()).chain(sizes.time.heads.iter().flatten().copied()).collect();
         let f_time = chain(matrix(encoding, inputs, &device), &self.weight("net.time")?, &widths, false);

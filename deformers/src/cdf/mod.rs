@@ -95,7 +95,8 @@ impl Cdf {
         let matrix = trunk.clone().narrow(0, 0, w * w).reshape([w, w]);
         let bias = trunk.clone().narrow(0, w * w, w).reshape([1, w]);
         let rest = trunk.narrow(0, w * (w + 1), len - w * (w + 1));
-        let encoding = time::encode(time_norm, self.sizes.time_bands);
+        let network = &self.config.network;
+        let encoding = time::encode_scaled(time_norm, self.sizes.time_bands, network.cycles, network.falloff);
         let inputs = encoding.len();
         let encoding = Tensor::<2>::from_data(TensorData::new(encoding, [1, inputs]), &matrix.device());
         let f_time = single(mlp_relu(encoding, self.net(1), &self.time)?)?;

@@ -2,7 +2,7 @@
 
 use crate::forward::network;
 use crate::networks::ReluShape;
-use crate::time::encode;
+use crate::time::encode_scaled;
 use std::sync::Arc;
 
 /// Falloff of the network's input bands. It favours smooth functions, so that the network does not fit each training time separately.
@@ -61,12 +61,7 @@ impl TemporalFunctions {
     }
     /// t and the bands; the amplitude of each band is 2^-falloff times that of the next lower one.
     fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
-        let mut encoding = encode(time_norm * self.cycles, self.bands);
-        encoding[0] = time_norm;
-        for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
-            pair.iter_mut().for_each(|v| *v *= (-falloff * band as f32).exp2());
-        }
-        encoding
+        encode_scaled(time_norm, self.bands, self.cycles, falloff)
     }
 }
 

@@ -118,9 +118,9 @@ fn vertex_reuse_changes_the_work_and_not_one_bit() {
 #[test]
 fn outputs_and_all_gradients_match_the_formulas() {
     for (name, device) in devices() {
-        for fusion in ["film", "concat"] {
+        for fusion in ["fusion = \"film\"", "fusion = \"concat\"", "cycles = 0.5\nfalloff = 1.0"] {
             let device = device.clone().autodiff();
-            let mut field = field(&format!("{TINY}fusion = \"{fusion}\""), &device);
+            let mut field = field(&format!("{TINY}{fusion}"), &device);
             shake(&mut field, &device);
             let points = centres(300);
             let (_, offsets) = evaluate(&field, &points, 0.43, &device);
@@ -140,6 +140,21 @@ fn outputs_and_all_gradients_match_the_formulas() {
             }
         }
     }
+}
+
+#[test]
+fn the_encoding_of_time_follows_cycles_and_falloff() {
+    let device = Device::flex();
+    let motion = |text: &str, time: f32| {
+        let mut field = field(&format!("{TINY}{text}"), &device);
+        shake(&mut field, &device);
+        values(evaluate(&field, &centres(50), time, &device).1.means.expect("a head"))
+    };
+    assert_eq!(motion("time_bands = 1\nfalloff = 4.0", 0.3), motion("time_bands = 1", 0.3), "the lowest band has its whole size");
+    assert_ne!(motion("time_bands = 2\nfalloff = 4.0", 0.3), motion("time_bands = 2", 0.3));
+    assert_ne!(motion("time_bands = 2\ncycles = 0.5", 1.0), motion("time_bands = 2", 1.0));
+    // At 0 all cycles begin.
+    assert_eq!(motion("time_bands = 2\ncycles = 0.5", 0.0), motion("time_bands = 2", 0.0));
 }
 
 #[test]
@@ -240,6 +255,9 @@ fn odd_requests_get_answers() {
         "hidden = [0]",
         "lr_start = nan",
         "hashes = 100000",
+        "cycles = 0.0",
+        "falloff = -1.0",
+        "falloff = nan",
     ] {
         let e = Cdf::new(config(text), &context(300), &device).err().unwrap_or_else(|| panic!("'{text}' was accepted"));
         assert!(e.to_string().contains("deformer"), "{e}");
