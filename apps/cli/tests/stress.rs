@@ -54,7 +54,7 @@ fn deformers_and_loss_terms_are_compared_with_float64() {
     assert!(limit["level"].is_string(), "{limit}");
     // The value of a loss term is one number, which may be exact by chance.
     let losses: BTreeSet<&str> = parts(&|_| true).into_iter().filter(|part| part.starts_with("loss ")).collect();
-    assert_eq!(losses.len(), 7, "{losses:?}");
+    assert_eq!(losses.len(), 8, "{losses:?}");
     for part in losses {
         let compared = of(part);
         let good = |case: &&Value| case["oracle"] == "float64" && case["error"].as_f64().is_some_and(|error| error < 1e-5);

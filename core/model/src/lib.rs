@@ -9,7 +9,9 @@ mod appearance;
 pub mod conformance;
 mod deformer;
 mod density;
+mod depth;
 mod device;
+mod frame_cache;
 pub mod gaussians;
 mod life;
 mod loss;
@@ -47,6 +49,7 @@ pub use deformer::{
     SpatialInput, check_attributes, check_parameters,
 };
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
+pub use depth::DepthImage;
 pub use device::{DEVICE_NAMES, parse_device, resolved_device};
 pub use gaussians::Gaussians;
 pub use life::{LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, gate_value};
@@ -57,7 +60,8 @@ pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, pa
 pub use preset::{PresetPlugin, PresetRole};
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, SplatColors, Splats};
 pub use reader::{
-    Background, CameraRef, Distortion, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SAME_TIME, SceneOptions, SyncMode,
+    Background, CameraRef, DepthFile, Distortion, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SAME_TIME, SceneOptions,
+    SyncMode,
 };
 pub use registry::Registry;
 pub use scene::{FrameSource, NoImages, PointCloud, Scene, Split, View};

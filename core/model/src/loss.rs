@@ -13,6 +13,9 @@ pub struct LossInput<'a> {
     pub planes: &'a Tensor<3>,
     /// Recorded planes `[3,H,W]` in 0..1, or the mask `[1,H,W]` of the score stage.
     pub target: &'a Tensor<3>,
+    /// Recorded depth `[1,H,W]`: along the z axis of the camera, in units of the scene as the rendered one, 0 where it is unknown. `None` where the view has
+    /// none, in the score stage, and unless a term [wants it](LossTerm::wants_depth).
+    pub depth: Option<&'a Tensor<3>>,
     /// The camera of the view, at the size of the planes. Its name is that of the dataset.
     pub camera: &'a Camera,
     /// The view: its frame among those that the scene has, counted from 0, and its time.
@@ -34,6 +37,7 @@ pub struct LossInput<'a> {
 
 impl<'a> LossInput<'a> {
     /// What is seen of `gaussians` by `camera` in `view`; the fields say what the arguments are. The Gaussians stand still: `canonical` is `gaussians`.
+    /// There is no recorded depth.
     pub fn new(
         camera: &'a Camera,
         view: &'a View,
@@ -43,11 +47,15 @@ impl<'a> LossInput<'a> {
         radii: &'a Tensor<1, Int>,
         schedule: &'a Schedule,
     ) -> Self {
-        Self { planes, target, camera, view, gaussians, canonical: gaussians, radii, time_norm: view.time_norm, schedule }
+        Self { planes, target, depth: None, camera, view, gaussians, canonical: gaussians, radii, time_norm: view.time_norm, schedule }
     }
     /// The same view of Gaussians that a deformer moved from `canonical`, which has as many.
     pub fn moved_from(self, canonical: &'a Gaussians) -> Self {
         Self { canonical, ..self }
+    }
+    /// The same view with recorded `depth`, if there is some.
+    pub fn with_depth(self, depth: Option<&'a Tensor<3>>) -> Self {
+        Self { depth, ..self }
     }
 }
 
@@ -56,6 +64,10 @@ pub trait LossTerm: Send {
     /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training. Add many numbers
     /// with [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
+    /// Whether the term compares recorded depth, [`LossInput::depth`]. It is read for terms that do, and a scene without it is refused then.
+    fn wants_depth(&self) -> bool {
+        false
+    }
 }
 
 /// A loss term in the registry.

@@ -1,10 +1,9 @@
 //! A scene: cameras, times, and 8-bit frames that are decoded on demand.
 
-use crate::{Camera, Error, Image8, Result, Similarity};
+use crate::frame_cache::{FrameCache, KeptFrames};
+use crate::{Camera, DepthImage, Error, Image8, Result, Similarity};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 /// The part of the split that a view belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -60,6 +59,15 @@ pub trait FrameSource: Send + Sync {
     fn motion_mask(&self, _view: usize) -> Result<Option<Image8>> {
         Ok(None)
     }
+    /// The recorded depth of that image, where there is one. The source of a [`Scene`] returns it at the size of the camera, in units of the scene. That of a
+    /// reader returns it as it was taken, through the lens, in units of the dataset and with the proportions of the image. It is asked for where a loss term
+    /// compares it, and by who wants to know whether there is one.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a depth that cannot be read.
+    fn depth(&self, _view: usize) -> Result<Option<DepthImage>> {
+        Ok(None)
+    }
 }
 
 /// The source of a scene that has cameras and times, and no images.
@@ -72,7 +80,7 @@ impl FrameSource for NoImages {
     }
 }
 
-/// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes; clones share the cache, derived scenes its bound.
+/// A dynamic scene. Frames and recorded depth are decoded on demand and cached up to a number of bytes; clones share the cache, derived scenes its bound.
 #[derive(Clone)]
 pub struct Scene {
     /// Display name.
@@ -104,10 +112,9 @@ impl Scene {
     /// # Errors
     /// [`Error::Data`] for a scene without training views, views of cameras that do not exist or with times outside 0..1, and invalid cameras.
     pub fn new(name: impl Into<String>, cameras: Vec<Camera>, views: Vec<View>, source: Arc<dyn FrameSource>, cache_bytes: u64) -> Result<Self> {
-        let kept = KeptFrames { cap: cache_bytes, caches: AtomicUsize::new(0), state: Mutex::default() };
-        Self::over(name.into(), cameras, views, FrameCache::new(source, Arc::new(kept)))
+        Self::over(name.into(), cameras, views, FrameCache::new(source, Arc::new(KeptFrames::new(cache_bytes))))
     }
-    /// The views of this scene with other `cameras` and the images of `source`, of another size, say. The frames of both scenes together are cached up to
+    /// The views of this scene with other `cameras` and images and depth of `source`, of another size, say. The frames of both scenes together are cached up to
     /// [`Scene::cache_bytes`].
     ///
     /// # Errors
@@ -144,7 +151,7 @@ impl Scene {
             frames: Arc::new(frames),
         })
     }
-    /// The most bytes of decoded frames that are kept, of this scene and those derived from it together.
+    /// The most bytes of decoded frames and depth that are kept, of this scene and those derived from it together.
     pub fn cache_bytes(&self) -> u64 {
         self.frames.kept.cap
     }
@@ -163,7 +170,32 @@ impl Scene {
     }
     /// The image of a view, from the cache or decoded now.
     pub fn frame(&self, view: usize) -> Result<Arc<Image8>> {
-        self.frames.get(view)
+        self.frames.image(view)
+    }
+    /// The recorded depth of a view at the size of its camera, in units of the scene, from the cache or read now. `None` where the dataset has none.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a depth that cannot be read or has another size.
+    pub fn depth(&self, view: usize) -> Result<Option<Arc<DepthImage>>> {
+        let Some(depth) = self.frames.depth(view)? else { return Ok(None) };
+        let camera = self.camera(view);
+        if (depth.width, depth.height) != (camera.width, camera.height) {
+            let problem = format!("{}x{} pixels, its camera has {}x{}", depth.width, depth.height, camera.width, camera.height);
+            return Err(Error::data(format!("depth of view {view}"), problem, "Correct the source of the scene: depth has the size of the camera"));
+        }
+        Ok(Some(depth))
+    }
+    /// Whether a training view has recorded depth. The first one that has is read.
+    ///
+    /// # Errors
+    /// As [`Scene::depth`].
+    pub fn has_depth(&self) -> Result<bool> {
+        for view in self.split(Split::Train) {
+            if self.depth(view)?.is_some() {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
     /// Which pixels of a view see something that moves, row by row, where the dataset knows it (built-in captures do). `None` for a scene of one frame.
     /// Computed at every call. For scores, not for training.
@@ -186,85 +218,10 @@ impl Scene {
     }
 }
 
-/// The frames of a source, those of them that are kept among others in [`KeptFrames`].
-struct FrameCache {
-    source: Arc<dyn FrameSource>,
-    /// Its number among those that share `kept`.
-    number: usize,
-    kept: Arc<KeptFrames>,
-}
-
-/// What is kept of the frames of a scene and of those derived from it.
-struct KeptFrames {
-    cap: u64,
-    caches: AtomicUsize,
-    state: Mutex<CacheState>,
-}
-
-#[derive(Default)]
-struct CacheState {
-    /// By cache and view: an image, and when it was last used.
-    frames: HashMap<(usize, usize), (Arc<Image8>, u64)>,
-    bytes: u64,
-    clock: u64,
-}
-
-impl FrameCache {
-    fn new(source: Arc<dyn FrameSource>, kept: Arc<KeptFrames>) -> Self {
-        Self { source, number: kept.caches.fetch_add(1, Ordering::Relaxed), kept }
-    }
-    fn get(&self, view: usize) -> Result<Arc<Image8>> {
-        let key = (self.number, view);
-        if let Ok(mut state) = self.kept.state.lock() {
-            state.clock += 1;
-            let now = state.clock;
-            if let Some((image, used)) = state.frames.get_mut(&key) {
-                *used = now;
-                return Ok(image.clone());
-            }
-        }
-        // Decoded outside the lock, so that prefetching threads work in parallel.
-        let image = Arc::new(self.source.load(view)?);
-        if let Ok(mut state) = self.kept.state.lock() {
-            state.keep(key, &image, self.kept.cap);
-        }
-        Ok(image)
-    }
-}
-
-impl Drop for FrameCache {
-    /// Nobody can ask for its frames any more, and others may use their bytes.
-    fn drop(&mut self) {
-        if let Ok(mut state) = self.kept.state.lock() {
-            let CacheState { frames, bytes, .. } = &mut *state;
-            frames.retain(|(cache, _), _| *cache != self.number);
-            *bytes = frames.values().map(|(image, _)| image.data.len() as u64).sum();
-        }
-    }
-}
-
-impl CacheState {
-    /// Keeps `image` in place of the frames that were not used for longest.
-    fn keep(&mut self, key: (usize, usize), image: &Arc<Image8>, cap: u64) {
-        let size = image.data.len() as u64;
-        // What another thread has decoded, too, or what never fits, is no reason to drop others.
-        if size > cap || self.frames.contains_key(&key) {
-            return;
-        }
-        while self.bytes + size > cap {
-            let Some(oldest) = self.frames.iter().min_by_key(|(_, (_, used))| *used).map(|(&key, _)| key) else { break };
-            if let Some((old, _)) = self.frames.remove(&oldest) {
-                self.bytes -= old.data.len() as u64;
-            }
-        }
-        self.bytes += size;
-        self.frames.insert(key, (image.clone(), self.clock));
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     /// Images of so many bytes, and how many were loaded.
     struct Counted {
@@ -277,6 +234,45 @@ mod tests {
             self.loads.fetch_add(1, Ordering::Relaxed);
             Ok(Image8 { width: (self.bytes / 3) as u32, height: 1, channels: 3, data: vec![0; self.bytes] })
         }
+    }
+
+    /// Images of 300 bytes and depth of 400, of another size in view 2 and of none in view 0, and how often depth was read.
+    #[derive(Default)]
+    struct Deep(AtomicUsize);
+
+    impl FrameSource for Deep {
+        fn load(&self, _: usize) -> Result<Image8> {
+            Ok(Image8 { width: 100, height: 1, channels: 3, data: vec![0; 300] })
+        }
+        fn depth(&self, view: usize) -> Result<Option<DepthImage>> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            let width = if view == 2 { 90 } else { 100 };
+            Ok((view > 0).then(|| DepthImage { width, height: 1, values: vec![1.0; width as usize] }))
+        }
+    }
+
+    #[test]
+    fn depth_and_frames_share_one_bound() {
+        let scene = |cache_bytes: u64, source: Arc<dyn FrameSource>| {
+            let camera = Camera::look_at("a", (100, 1), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+            let views = (0..3).map(|frame| View { camera: 0, frame, time_norm: 0.0, split: Split::Train }).collect();
+            Scene::new("s", vec![camera], views, source, cache_bytes).unwrap()
+        };
+        let reads = |cache_bytes: u64| {
+            let source = Arc::new(Deep::default());
+            let scene = scene(cache_bytes, source.clone());
+            for _ in 0..2 {
+                assert_eq!(scene.depth(1).unwrap().unwrap().values, [1.0; 100]);
+                scene.frame(1).unwrap();
+            }
+            source.0.load(Ordering::Relaxed)
+        };
+        assert_eq!((reads(699), reads(700)), (2, 1), "400 bytes of depth and 300 of the image");
+        let deep = scene(0, Arc::new(Deep::default()));
+        assert!(deep.has_depth().unwrap() && deep.depth(0).unwrap().is_none());
+        let message = deep.depth(2).unwrap_err().to_string();
+        assert!(message.contains("90x1 pixels, its camera has 100x1"), "{message}");
+        assert!(!scene(0, Arc::new(NoImages)).has_depth().unwrap());
     }
 
     #[test]
@@ -314,7 +310,7 @@ mod tests {
         let scene = Scene::new("s", camera(), views, large.clone(), 1000).unwrap();
         let kept = || {
             let state = scene.frames.kept.state.lock().unwrap();
-            assert_eq!(state.bytes, state.frames.values().map(|(image, _)| image.data.len() as u64).sum::<u64>());
+            assert_eq!(state.bytes, state.frames.values().map(|(kept, _)| kept.bytes()).sum::<u64>());
             state.bytes
         };
         let derived = scene.derived(camera(), small.clone()).unwrap();

@@ -1,5 +1,6 @@
 //! Loss terms.
 
+mod depth;
 mod dssim;
 mod l1;
 mod mask_bce;

@@ -36,7 +36,7 @@ const OURS: [(&str, &[&str]); 9] = [
     ("exporter", &["gltf", "mp4", "ply", "ply-sequence", "sog", "splatv", "spz", "web"]),
     ("rasterizer", &["reference", "tile"]),
     ("density", &["clone-split", "mcmc", "none"]),
-    ("loss", &["dssim", "l1", "mask-bce", "mse", "opacity", "photometric", "scale"]),
+    ("loss", &["depth", "dssim", "l1", "mask-bce", "mse", "opacity", "photometric", "scale"]),
     ("appearance", &["affine", "none"]),
     ("optimizer", &["adam"]),
 ];

@@ -15,6 +15,7 @@ mod codecs;
 mod colors;
 mod columns;
 mod conformance;
+mod depth;
 mod end_to_end;
 mod fresh_cases;
 mod golden_codec;

@@ -155,6 +155,8 @@ fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
     let pixels = SIZE[0] * SIZE[1];
     let draw = |seed: u64, count: usize| -> Vec<f32> { (0..count).map(|k| 0.5 + 0.5 * uniform(Seed::root(seed), k)).collect() };
     let target = draw(2, 3 * pixels);
+    // Every fifth pixel is unknown.
+    let depth: Vec<f32> = draw(3, pixels).into_iter().enumerate().map(|(k, z)| if k.is_multiple_of(5) { 0.0 } else { 0.5 + z }).collect();
     let host = HostGaussians {
         means: vec![0.0; 3],
         log_scales: vec![-2.0; 3],
@@ -171,14 +173,14 @@ fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
         let values = |device: &Device| -> Result<Vec<f32>> {
             let term = (job.registry.loss(name)?.build)(&toml::Table::new())?;
             let tensor = |values: &[f32]| Tensor::<3>::from_data(TensorData::new(values.to_vec(), [values.len() / pixels, SIZE[0], SIZE[1]]), device);
-            let (planes, target) = (tensor(&planes), tensor(&target));
+            let (planes, target, depth) = (tensor(&planes), tensor(&target), tensor(&depth));
             let gaussians = Gaussians::from_host(&host, device);
             let radii = Tensor::<1, Int>::from_data(TensorData::new(vec![3i64], [1]), device);
             let input = LossInput::new(&camera, &view, &planes, &target, &gaussians, &radii, &schedule);
-            term.value(&input)?.map_or(Ok(vec![0.0]), |value| to_vec(value, "loss"))
+            term.value(&input.with_depth(Some(&depth)))?.map_or(Ok(vec![0.0]), |value| to_vec(value, "loss"))
         };
         let exact = || -> Result<Option<Vec<f32>>> {
-            let input = LossValues { planes: &planes, target: &target, size: SIZE, gaussians: &host, extent: schedule.extent };
+            let input = LossValues { planes: &planes, target: &target, depth: &depth, size: SIZE, gaussians: &host, extent: schedule.extent };
             Ok(losses::value(name, &input).map(|value| vec![value as f32]))
         };
         let exploded = case(&format!("loss {name}"), "exploding images", format!("{level:e}"), || compared(job, values, exact));

@@ -163,6 +163,7 @@ fn facts(path: &Path, scene: &Scene) -> Result<Value> {
         "image_sizes": sizes,
         "camera_extent": plain(&scene.extent())?,
         "normalisation": plain(&scene.normalisation)?,
+        "recorded_depth": scene.has_depth().map_or_else(|e| Value::from(e.to_string()), Value::from),
         "initial_points": scene.points.as_ref().map(|p| p.positions.len()),
         "init_box": plain(&scene.init_box)?,
         "background": plain(&scene.background)?,
@@ -249,6 +250,7 @@ mod tests {
         assert_eq!(lines[1], "camera cam01: 9x6, 0 training, 2 validation and 0 test views");
         assert_eq!(lines[MOST_CAMERAS], "and 3 more cameras, which --json lists");
         let facts = facts(Path::new("s"), &scene).unwrap();
+        assert_eq!(facts["recorded_depth"], Value::Bool(false));
         assert_eq!(["train_views", "validation_views", "test_views"].map(|key| facts[key].as_u64()), [Some(26), Some(2), Some(2)]);
     }
 }

@@ -7,6 +7,8 @@ use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 
 /// Image size of the suite.
 const SIZE: [usize; 2] = [17, 23];
+/// Every so many pixels the depth of one is unknown.
+const UNKNOWN: usize = 5;
 /// Gaussians of the suite.
 const COUNT: usize = 6;
 /// How far apart a value as drawn and the canonical one are, at most.
@@ -26,7 +28,7 @@ const FUSED_TOLERANCE: f64 = 1e-4;
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - The value is one finite number and repeats bit for bit.
 /// - Gradients of the planes, of the Gaussians as drawn and of the canonical ones agree with finite differences.
-/// - Images of one pixel and sets without Gaussians give a value or an error.
+/// - Images of one pixel, sets without Gaussians, views without recorded depth and depth that is unknown everywhere give a value or `None`.
 /// - Where the Gaussians stand still, as in the coarse stage, value and gradients are finite.
 /// - A fused term is the weighted sum of the terms it replaces, which are looked up in `registry`.
 pub fn loss(plugin: &LossPlugin, settings: &toml::Table, registry: &Registry, device: &Device) -> Vec<String> {
@@ -65,6 +67,8 @@ struct Inputs {
     planes: Vec<f32>,
     /// `[3,H,W]`.
     target: Vec<f32>,
+    /// Recorded depth `[1,H,W]`, of some pixels; for terms that want it.
+    depth: Option<Vec<f32>>,
     /// As drawn.
     gaussians: HostGaussians,
     canonical: HostGaussians,
@@ -143,7 +147,8 @@ fn inputs(size: [usize; 2], count: usize, attributes: &[AttributeSpec]) -> Input
         values.iter_mut().enumerate().for_each(|(k, value)| *value += OFFSET * uniform(seed, k));
     }
     let planes = (0..5 * pixels).map(|k| draw(1, k)).collect();
-    Inputs { planes, target: (0..3 * pixels).map(|k| draw(2, k)).collect(), gaussians, canonical, size }
+    let depth = (0..pixels).map(|k| if k % UNKNOWN == UNKNOWN - 1 { 0.0 } else { draw(5, k) }).collect();
+    Inputs { planes, target: (0..3 * pixels).map(|k| draw(2, k)).collect(), depth: Some(depth), gaussians, canonical, size }
 }
 
 /// The planes, or a column or attribute of the Gaussians by name.
@@ -177,7 +182,9 @@ impl Suite<'_> {
         let device = self.device.clone().autodiff();
         let [h, w] = inputs.size;
         let leaf = |values: &[f32], shape: [usize; 3]| Tensor::<3>::from_data(TensorData::new(values.to_vec(), shape), &device);
-        let (planes, target) = (leaf(&inputs.planes, [5, h, w]), Tensor::<3>::from_inner(leaf(&inputs.target, [3, h, w]).inner()));
+        let constant = |values: &[f32], planes: usize| Tensor::<3>::from_inner(leaf(values, [planes, h, w]).inner());
+        let (planes, target) = (leaf(&inputs.planes, [5, h, w]), constant(&inputs.target, 3));
+        let depth = inputs.depth.as_ref().filter(|_| term.wants_depth()).map(|depth| constant(depth, 1));
         let [gaussians, canonical] = [&inputs.gaussians, &inputs.canonical].map(|host| Gaussians::from_host(host, &device));
         let mut leaves = Leaves { planes, gaussians, canonical };
         if track {
@@ -188,7 +195,7 @@ impl Suite<'_> {
         let (view, schedule) = (View { camera: 0, frame: 4, time_norm: 0.4, split: Split::Train }, Schedule::main(100));
         let Leaves { planes, gaussians, canonical } = &leaves;
         let input = LossInput::new(&camera, &view, planes, &target, gaussians, &radii, &schedule).moved_from(canonical);
-        Ok((term.value(&input)?, leaves))
+        Ok((term.value(&input.with_depth(depth.as_ref()))?, leaves))
     }
     fn number(&self, term: &dyn LossTerm, inputs: &Inputs) -> Result<f64> {
         let value = self.value(term, inputs, false)?.0;
@@ -252,6 +259,8 @@ impl Suite<'_> {
             ("no Gaussians", self.inputs(SIZE, 0)),
             ("one row", self.inputs([1, 30], 1)),
             ("Gaussians without attributes", inputs(SIZE, COUNT, &[])),
+            ("no depth", Inputs { depth: None, ..self.inputs(SIZE, COUNT) }),
+            ("depth that is unknown everywhere", Inputs { depth: Some(vec![0.0; SIZE[0] * SIZE[1]]), ..self.inputs(SIZE, COUNT) }),
         ] {
             let value = self.number(term.as_ref(), &inputs)?;
             if !value.is_finite() {
@@ -287,92 +296,4 @@ impl Suite<'_> {
 
 #[cfg(test)]
 #[cfg(feature = "cpu")]
-mod tests {
-    use super::*;
-    use crate::{Error, Plugin, ordered_sum};
-
-    /// The mean squared velocity of the Gaussians. With `strict`, Gaussians without velocities are an error; without `learns`, it has no gradient.
-    struct Slow {
-        strict: bool,
-        learns: bool,
-    }
-
-    impl LossTerm for Slow {
-        fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
-            let velocities = match input.gaussians.extra.get("velocity") {
-                Some(velocities) if !input.gaussians.is_empty() => velocities.clone(),
-                None if self.strict => return Err(Error::parameter("loss slow", "there are no velocities", "Choose a deformer that has some")),
-                _ => return Ok(None),
-            };
-            let velocities = if self.learns { velocities } else { velocities.detach() };
-            Ok(Some(ordered_sum(velocities.powi_scalar(2)).div_scalar(3.0 * input.gaussians.len() as f32)))
-        }
-    }
-
-    /// The mean square of how far Gaussians move along the direction in which the camera looks, or with `root` the root of it. The canonical ones get the share
-    /// `share` of their gradient.
-    struct Approach {
-        root: bool,
-        share: f32,
-    }
-
-    impl LossTerm for Approach {
-        fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
-            let (gaussians, canonical, camera) = (input.gaussians, input.canonical.means.clone(), input.camera);
-            if gaussians.is_empty() {
-                return Ok(None);
-            }
-            assert_eq!([camera.height as usize, camera.width as usize], input.planes.dims()[1..]);
-            let canonical = canonical.clone().mul_scalar(self.share) + canonical.detach().mul_scalar(1.0 - self.share);
-            let forward = Tensor::<1>::from_floats(camera.forward_world().map(|x| x as f32), &canonical.device()).unsqueeze_dim::<2>(0);
-            let moved = ((gaussians.means.clone() - canonical) * forward).sum_dim(1);
-            let mean = ordered_sum(moved.powi_scalar(2)).div_scalar(gaussians.len() as f32);
-            Ok(Some(if self.root { mean.sqrt() } else { mean }))
-        }
-    }
-
-    type Build = fn(&toml::Table) -> Result<Box<dyn LossTerm>>;
-
-    fn findings(build: Build, attributes: &[AttributeSpec]) -> Vec<String> {
-        let info = Plugin { name: "a-term", version: "1", summary: "", paper: "", schema: "", capabilities: &[] };
-        let plugin = LossPlugin { info, build, fuses: None };
-        loss_of_attributes(&plugin, &toml::Table::new(), attributes, &Registry::collect().unwrap(), &Device::flex())
-    }
-
-    /// `term`, which has no settings.
-    fn plain(settings: &toml::Table, term: impl LossTerm + 'static) -> Result<Box<dyn LossTerm>> {
-        match settings.keys().next() {
-            None => Ok(Box::new(term)),
-            Some(key) => Err(Error::parameter(format!("loss: {key}"), "there is no such setting", "Remove it")),
-        }
-    }
-
-    #[test]
-    fn a_term_may_compare_with_the_canonical_gaussians_and_know_the_camera() {
-        assert_eq!(findings(|settings| plain(settings, Approach { root: false, share: 1.0 }), &[]), [""; 0]);
-        let mistakes: [(Build, &str); 3] = [
-            (|settings| plain(settings, Approach { root: true, share: 1.0 }), "standing still: the gradient of means is not finite"),
-            (|settings| plain(settings, Approach { root: false, share: 0.5 }), "gradients: canonical means: the loss rises"),
-            (|settings| plain(settings, Approach { root: false, share: 0.0 }), "gradients: no gradient reaches canonical means"),
-        ];
-        for (build, finding) in mistakes {
-            let found = findings(build, &[]);
-            assert!(found.iter().any(|line| line.contains(finding)), "{finding}: {found:?}");
-        }
-    }
-
-    #[test]
-    fn a_term_may_read_attributes_of_a_deformer() {
-        let velocity = [AttributeSpec::new("velocity", 3, 0.0, 1e-3)];
-        assert_eq!(findings(|settings| plain(settings, Slow { strict: false, learns: true }), &velocity), [""; 0]);
-        let mistakes: [(Build, &[AttributeSpec], &str); 3] = [
-            (|settings| plain(settings, Slow { strict: false, learns: true }), &[], "it returns no value for an ordinary view"),
-            (|settings| plain(settings, Slow { strict: true, learns: true }), &velocity, "there are no velocities"),
-            (|settings| plain(settings, Slow { strict: false, learns: false }), &velocity, "gradients"),
-        ];
-        for (build, attributes, finding) in mistakes {
-            let found = findings(build, attributes);
-            assert!(found.iter().any(|line| line.contains(finding)), "{finding}: {found:?}");
-        }
-    }
-}
+mod tests;

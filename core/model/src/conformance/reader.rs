@@ -21,7 +21,7 @@ const ABSURD: [&str; 6] = ["1e308", "-1", "99999999999999999999", "0", "nan", ""
 /// - It recognises the folder, and neither an empty nor a missing one.
 /// - Opening twice gives equal scenes.
 /// - Poses are rigid; times lie in 0..1 and increase with frames; there is a training view.
-/// - Images and masks have the size of their cameras, or a scaled size of the same aspect.
+/// - Images and masks have the size of their cameras, or a scaled size of the same aspect; recorded depth has this aspect and can be read.
 /// - A scene marked as resized has the size of `scene.width`.
 /// - Damaged copies of its files (truncated, flipped bits, absurd numbers) give errors or valid scenes, never a panic.
 ///
@@ -127,7 +127,7 @@ fn image(camera: &RawCamera, source: &ImageSource) -> Result<bool> {
     match source {
         ImageSource::Video { .. } => Ok(false),
         ImageSource::File { path, .. } if !path.is_file() => Ok(false),
-        ImageSource::File { path, mask } => {
+        ImageSource::File { path, mask, depth } => {
             let object = path.display().to_string();
             let found = files::read_png_or_jpeg(path, &LIMITS)?;
             fits(&object, camera, &found, true)?;
@@ -141,9 +141,19 @@ fn image(camera: &RawCamera, source: &ImageSource) -> Result<bool> {
                     ));
                 }
             }
+            if let Some(file) = depth {
+                let depth = files::read_depth(&file.path, file.unit, &LIMITS)?;
+                depth.validate_for(&file.path.display().to_string(), [found.width, found.height])?;
+            }
             Ok(true)
         }
-        ImageSource::Frames { source, index } => fits(&format!("image {index}"), camera, &source.load(*index)?, false).map(|()| true),
+        ImageSource::Frames { source, index } => {
+            fits(&format!("image {index}"), camera, &source.load(*index)?, false)?;
+            if let Some(depth) = source.depth(*index)? {
+                depth.validate_for(&format!("the depth of image {index}"), camera.size)?;
+            }
+            Ok(true)
+        }
     }
 }
 
@@ -272,7 +282,44 @@ fn numbers(text: &str) -> Vec<(usize, usize)> {
 
 #[cfg(test)]
 mod tests {
-    use super::numbers;
+    use super::{ImageSource, RawCamera, image, numbers};
+    use crate::{DepthFile, DepthImage, Distortion, FrameSource, Image8, Result};
+    use std::sync::Arc;
+
+    /// An image of 8x6 pixels, and depth of as many as stated.
+    struct Deep([u32; 2]);
+
+    impl FrameSource for Deep {
+        fn load(&self, _: usize) -> Result<Image8> {
+            Ok(Image8 { width: 8, height: 6, channels: 3, data: vec![0; 144] })
+        }
+        fn depth(&self, _: usize) -> Result<Option<DepthImage>> {
+            let [width, height] = self.0;
+            Ok(Some(DepthImage { width, height, values: vec![1.0; (width * height) as usize] }))
+        }
+    }
+
+    #[test]
+    fn depth_of_other_proportions_is_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, named) = (folder.path().join("a.png"), folder.path().join("depth.png"));
+        ::image::RgbImage::new(8, 6).save(&path).unwrap();
+        let camera = RawCamera {
+            name: "a".into(),
+            size: [8, 6],
+            focal: [9.0; 2],
+            principal: [4.0, 3.0],
+            distortion: Distortion::None,
+            world_to_camera: std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j)))),
+        };
+        for (size, fits) in [([8, 6], true), ([4, 3], true), ([6, 8], false)] {
+            ::image::ImageBuffer::<::image::Luma<u16>, Vec<u16>>::new(size[0], size[1]).save(&named).unwrap();
+            let file = ImageSource::File { path: path.clone(), mask: None, depth: Some(DepthFile { path: named.clone(), unit: 1e-3 }) };
+            for source in [file, ImageSource::Frames { source: Arc::new(Deep(size)), index: 0 }] {
+                assert_eq!(image(&camera, &source).is_ok(), fits, "{source:?}, depth of {size:?} pixels");
+            }
+        }
+    }
 
     #[test]
     fn numbers_are_found_in_text() {

@@ -1,6 +1,6 @@
 //! Reading of untrusted files: sizes are checked before memory is allocated.
 
-use crate::{Error, Image8, Limits, Result};
+use crate::{DepthImage, Error, Image8, Limits, Result};
 use image::error::ImageFormatHint;
 use image::{DynamicImage, ImageError, ImageReader};
 use serde::de::DeserializeOwned;
@@ -132,6 +132,43 @@ pub fn image_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
 /// # Errors
 /// [`Error::Data`] for unreadable or truncated images, [`Error::Limit`].
 pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
+    let decoded = decoded(path, limits)?;
+    let (width, height) = (decoded.width(), decoded.height());
+    let (channels, data) = match decoded {
+        DynamicImage::ImageRgb8(i) => (3, i.into_raw()),
+        DynamicImage::ImageRgba8(i) => (4, i.into_raw()),
+        other if other.color().has_alpha() => (4, other.into_rgba8().into_raw()),
+        other => (3, other.into_rgb8().into_raw()),
+    };
+    Ok(Image8 { width, height, channels, data })
+}
+
+/// Decodes a PNG of 16-bit grey values as depth: `unit` world units per step, and 0 where the depth is unknown.
+///
+/// # Errors
+/// [`Error::Data`] for a unit that is no positive number, for unreadable images, for values that are not 16-bit grey and for depths that are not finite;
+/// [`Error::Limit`].
+pub fn read_depth(path: &Path, unit: f64, limits: &Limits) -> Result<DepthImage> {
+    let object = path.display().to_string();
+    if !(unit.is_finite() && unit > 0.0) {
+        let remedy = "Correct the unit that the dataset states: depth_unit_scale_factor of a transforms.json is 0.001 for millimetres in a world of metres";
+        return Err(Error::data(object, format!("a step of depth is {unit} units, which is no positive number"), remedy));
+    }
+    let steps = match decoded(path, limits)? {
+        DynamicImage::ImageLuma16(steps) => steps,
+        other => {
+            let problem = format!("it is no depth: its pixels are {:?}, not 16-bit grey", other.color());
+            return Err(Error::data(object, problem, "Write depth as a PNG of 16-bit grey values"));
+        }
+    };
+    let (width, height) = steps.dimensions();
+    let depth = DepthImage { width, height, values: steps.into_raw().into_iter().map(|step| (f64::from(step) * unit) as f32).collect() };
+    depth.validate(&object)?;
+    Ok(depth)
+}
+
+/// A PNG or JPEG of at most `limits.max_pixels`, as it is stored.
+fn decoded(path: &Path, limits: &Limits) -> Result<DynamicImage> {
     let bytes = read_bytes(path, limits)?;
     if bytes.starts_with(&[0xff, 0xd8]) && jpeg_is_cut(&bytes) {
         return Err(image_error(path, "the JPEG ends before its end marker"));
@@ -144,17 +181,10 @@ pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
     caps.max_alloc = Some(limits.max_bytes);
     reader.limits(caps);
     let decoded = reader.decode().map_err(|e| not_decoded(path, e))?;
-    let (width, height) = (decoded.width(), decoded.height());
-    let (channels, data) = match decoded {
-        DynamicImage::ImageRgb8(i) => (3, i.into_raw()),
-        DynamicImage::ImageRgba8(i) => (4, i.into_raw()),
-        other if other.color().has_alpha() => (4, other.into_rgba8().into_raw()),
-        other => (3, other.into_rgb8().into_raw()),
-    };
-    if width == 0 || height == 0 {
+    if decoded.width() == 0 || decoded.height() == 0 {
         return Err(image_error(path, "it has no pixels"));
     }
-    Ok(Image8 { width, height, channels, data })
+    Ok(decoded)
 }
 
 /// Whether a JPEG ends before its end marker. A truncated one still decodes, with grey for missing data. What follows the end marker, such as the film of a

@@ -36,7 +36,7 @@ mod raw;
 
 pub use lens::Distortion;
 pub use options::{Background, CameraRef, SceneOptions, SyncMode};
-pub use raw::{ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, SAME_TIME};
+pub use raw::{DepthFile, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, SAME_TIME};
 
 use crate::{Limits, Plugin, Result, plugin_kind};
 use std::path::Path;

@@ -43,15 +43,26 @@ impl RawCamera {
     }
 }
 
+/// A file of recorded depth, which [`files::read_depth`](super::files::read_depth) reads.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthFile {
+    /// A PNG of 16-bit grey values; 0 where the depth is unknown.
+    pub path: PathBuf,
+    /// Units of the dataset per step of the grey values.
+    pub unit: f64,
+}
+
 /// The source of a view's image.
 #[derive(Clone)]
 pub enum ImageSource {
-    /// A PNG or JPEG file, and a foreground mask of the same size if there is one.
+    /// A PNG or JPEG file, and a foreground mask of the same size and recorded depth if there are some.
     File {
         /// The image.
         path: PathBuf,
         /// White is foreground. The file may be missing.
         mask: Option<PathBuf>,
+        /// Its depth, of the proportions of the image.
+        depth: Option<DepthFile>,
     },
     /// A frame of a video, decoded by `ffmpeg` and turned as the file's display matrix says.
     Video {
@@ -69,10 +80,17 @@ pub enum ImageSource {
     },
 }
 
+impl ImageSource {
+    /// A PNG or JPEG file without mask and depth.
+    pub fn file(path: impl Into<PathBuf>) -> Self {
+        Self::File { path: path.into(), mask: None, depth: None }
+    }
+}
+
 impl fmt::Debug for ImageSource {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::File { path, mask } => f.debug_struct("File").field("path", path).field("mask", mask).finish(),
+            Self::File { path, mask, depth } => f.debug_struct("File").field("path", path).field("mask", mask).field("depth", depth).finish(),
             Self::Video { path, frame } => f.debug_struct("Video").field("path", path).field("frame", frame).finish(),
             Self::Frames { index, .. } => f.debug_struct("Frames").field("index", index).finish_non_exhaustive(),
         }
@@ -227,7 +245,7 @@ mod tests {
 
     #[test]
     fn times_that_differ_by_rounding_are_one_instant() {
-        let view = || RawView { camera: 0, frame: 0, time: None, split: Split::Train, image: ImageSource::File { path: "x.png".into(), mask: None } };
+        let view = || RawView { camera: 0, frame: 0, time: None, split: Split::Train, image: ImageSource::file("x.png") };
         let frames = |times: &[f64]| {
             let mut scene = RawScene { views: times.iter().map(|_| view()).collect(), ..Default::default() };
             scene.rank_times(&times.iter().map(|t| Some(*t)).collect::<Vec<_>>(), "t").unwrap();

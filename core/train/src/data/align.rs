@@ -140,7 +140,7 @@ mod tests {
             world_to_camera: std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j)))),
         };
         let view = |camera, frame: usize| {
-            let image = ImageSource::File { path: format!("{frame}.png").into(), mask: None };
+            let image = ImageSource::file(format!("{frame}.png"));
             RawView { camera, frame, time: None, split: Split::Train, image }
         };
         RawScene { cameras: ["a", "b", "c"].map(camera).to_vec(), views: (0..3).flat_map(|c| (0..10).map(move |f| view(c, f))).collect(), ..Default::default() }

@@ -71,15 +71,15 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
     let videos = VideoFrames::new(&raw.views, &plans, options)?;
     let jobs = raw.views.iter().map(|v| Job { image: Some(v.image.clone()), plan: v.camera }).collect();
     let mask = |image: &ImageSource| match image {
-        ImageSource::File { mask: Some(path), .. } if path.is_file() => Some(ImageSource::File { path: path.clone(), mask: None }),
+        ImageSource::File { mask: Some(path), .. } if path.is_file() => Some(ImageSource::file(path)),
         _ => None,
     };
     let masks: Vec<Job> = raw.views.iter().map(|v| Job { image: mask(&v.image), plan: v.camera }).collect();
     let has_masks = masks.iter().any(|j| j.image.is_some());
-    let source = SceneFrames { jobs, plans: plans.clone(), videos, limits: *limits };
+    let source = SceneFrames { jobs, plans: plans.clone(), videos, limits: *limits, scale: frame.scale };
     let mut scene = Scene::new(raw.name, cameras, views, Arc::new(source), options.cache_mb.saturating_mul(1_000_000))?;
     if has_masks {
-        let source: Arc<dyn FrameSource> = Arc::new(SceneFrames { jobs: masks, plans, videos: VideoFrames::default(), limits: *limits });
+        let source: Arc<dyn FrameSource> = Arc::new(SceneFrames { jobs: masks, plans, videos: VideoFrames::default(), limits: *limits, scale: frame.scale });
         scene.foreground_masks = Some(source);
     }
     let single = |p: [f64; 3]| p.map(|v| v as f32);

@@ -99,7 +99,7 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
         // Missing images are left out later.
         let size = || image_size(if path.is_file() { path } else { present }, limits);
         scene.cameras.push(camera(&frame.file_path, &frame.transform_matrix, &intrinsics, &size, &bad)?);
-        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::File { path: path.clone(), mask: None } });
+        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::file(path) });
         times.push(frame.time);
     }
     Ok(transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count())

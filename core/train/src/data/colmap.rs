@@ -221,7 +221,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             continue;
         }
         scene.cameras.push(camera);
-        let source = ImageSource::File { path: file_named(&image_folder, &image.name), mask: None };
+        let source = ImageSource::file(file_named(&image_folder, &image.name));
         scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, image: source });
     }
     Ok(scene)

@@ -61,13 +61,7 @@ mod tests {
 
     /// The frames of images of these cameras at these times, ranked by time as readers do, and what is said of them.
     fn frames(images: &[(usize, f64)]) -> (Vec<usize>, Vec<usize>, Vec<String>) {
-        let view = |&(camera, _): &(usize, f64)| RawView {
-            camera,
-            frame: 0,
-            time: None,
-            split: Split::Train,
-            image: ImageSource::File { path: "x.png".into(), mask: None },
-        };
+        let view = |&(camera, _): &(usize, f64)| RawView { camera, frame: 0, time: None, split: Split::Train, image: ImageSource::file("x.png") };
         let mut scene = RawScene { views: images.iter().map(view).collect(), ..Default::default() };
         scene.rank_times(&images.iter().map(|image| Some(image.1)).collect::<Vec<_>>(), "t").unwrap();
         let of = |views: &[RawView]| views.iter().map(|view| view.frame).collect::<Vec<_>>();

@@ -175,7 +175,7 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
 /// `10_left`.
 fn frames(mut files: Vec<PathBuf>, step: Option<u64>, warnings: &mut Vec<String>) -> Vec<Option<ImageSource>> {
     let step = step.filter(|_| least_step(&files).is_some());
-    let image = |path| Some(ImageSource::File { path, mask: None });
+    let image = |path: PathBuf| Some(ImageSource::file(path));
     if files.iter().any(|path| frame_number(path).is_none()) {
         files.sort_by_cached_key(|path| padded(&stem(path)));
         return files.into_iter().map(image).collect();

@@ -1,6 +1,6 @@
 //! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Static, unless images
 //! state a `time` (those of a camera that stands still are then frames of one camera) or an entry names a video, which is a camera with all frames of it. The
-//! points of `ply_file_path` are those of the scene.
+//! points of `ply_file_path` are those of the scene, the PNG files of `depth_file_path` its recorded depth.
 
 use super::assemble::fit_to_image;
 use super::fixed_cameras::{merge_fixed_cameras, warn_of_missing_times};
@@ -9,7 +9,7 @@ use super::masks::warn_of_mask_paths;
 use super::ply_points;
 use super::video::{self, Footage};
 use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_bytes, read_json};
-use cc4dgs_core::{Error, ImageSource, Limits, Plugin, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
+use cc4dgs_core::{DepthFile, Error, ImageSource, Limits, Plugin, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::collections::{BTreeMap, BTreeSet};
@@ -21,6 +21,8 @@ pub(crate) const HOLD_OUT_EVERY: usize = 8;
 pub(crate) const LEAST_HELD_OUT: usize = 3;
 /// What is said of fewer.
 pub(crate) const NOTHING_HELD_OUT: &str = "fewer than three images or cameras: none is held out (scene.test_cameras names some)";
+/// Units of depth per step where the file states none: millimetres, in a world of metres (nerfstudio's data conventions).
+const DEPTH_UNIT: f64 = 1e-3;
 
 #[derive(Deserialize)]
 struct Transforms {
@@ -29,6 +31,8 @@ struct Transforms {
     frames: Vec<Frame>,
     /// Points in the world of the frames' poses: where there is an `applied_transform`, both went through it.
     ply_file_path: Option<String>,
+    /// Units of the world per step of the depth images.
+    depth_unit_scale_factor: Option<f64>,
     #[serde(default)]
     train_filenames: Vec<String>,
     #[serde(default)]
@@ -45,6 +49,7 @@ struct Frame {
     transform_matrix: Vec<Vec<f64>>,
     time: Option<f64>,
     mask_path: Option<IgnoredAny>,
+    depth_file_path: Option<String>,
 }
 
 /// The file a JSON names. Backslashes of Windows separate folders, unless a file has them in its name.
@@ -105,7 +110,8 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let named = |names: &[String]| names.iter().map(|name| plain(name).to_string()).collect::<BTreeSet<_>>();
     let [train, test, validation] = [&transforms.train_filenames, &transforms.test_filenames, &transforms.val_filenames].map(|names| named(names));
     let named_split = [&train, &test, &validation].iter().any(|names| !names.is_empty());
-    let (mut missing, mut unlisted, mut seen) = (Vec::new(), 0, 0);
+    let unit = transforms.depth_unit_scale_factor.unwrap_or(DEPTH_UNIT);
+    let (mut missing, mut missing_depth, mut unlisted, mut seen) = (Vec::new(), 0, 0, 0);
     let mut times = Vec::new();
     let of_frame = |frame: &Frame, image_size: &dyn Fn() -> Result<(u32, u32)>, bad: &dyn Fn(String) -> Error| {
         camera(&frame.file_path, &frame.transform_matrix, &frame.own.over(&transforms.shared), image_size, bad)
@@ -143,7 +149,13 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         }
         scene.cameras.push(of_frame(frame, &|| image_size(&path, limits), &bad)?);
         times.push(frame.time);
-        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image: ImageSource::File { path, mask: None } });
+        let depth = frame.depth_file_path.as_ref().map(|named| file_named(folder, named)).filter(|f| f.is_file()).map(|path| DepthFile { path, unit });
+        missing_depth += usize::from(frame.depth_file_path.is_some() && depth.is_none());
+        let image = ImageSource::File { path, mask: None, depth };
+        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image });
+    }
+    if missing_depth > 0 {
+        scene.warnings.push(format!("{missing_depth} images have a depth_file_path that names no file; their depth is unknown"));
     }
     if !missing.is_empty() {
         let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");

@@ -86,7 +86,7 @@ fn read_meta(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &m
             });
             let path = folder.join("ims").join(&meta.files[t][c]);
             let mask = Some(folder.join("seg").join(&meta.files[t][c]).with_extension("png"));
-            scene.views.push(RawView { camera, frame: t, time: None, split, image: ImageSource::File { path, mask } });
+            scene.views.push(RawView { camera, frame: t, time: None, split, image: ImageSource::File { path, mask, depth: None } });
         }
     }
     Ok(())

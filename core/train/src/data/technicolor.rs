@@ -91,7 +91,7 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         }
         let split = if camera == TEST_CAMERA { Split::Test } else { Split::Train };
         let frame = frames.partition_point(|&f| f < frame);
-        scene.views.push(RawView { camera: camera as usize, frame, time: None, split, image: ImageSource::File { path, mask: None } });
+        scene.views.push(RawView { camera: camera as usize, frame, time: None, split, image: ImageSource::file(path) });
     }
     if scene.views.iter().all(|view| view.split != Split::Test) {
         scene.warnings.push(format!("there is no image of camera {TEST_CAMERA}; nothing is held out"));

@@ -78,17 +78,22 @@ impl Undistort {
     pub fn principal_point(&self) -> [f64; 2] {
         [self.principal[0] - f64::from(self.origin[0]), self.principal[1] - f64::from(self.origin[1])]
     }
+    /// Where the source shows what the pinhole image has at (u, v), in pixels of each.
+    pub fn source(&self, u: f64, v: f64) -> (f64, f64) {
+        let x = (u + f64::from(self.origin[0]) - self.principal[0]) / self.focal[0];
+        let y = (v + f64::from(self.origin[1]) - self.principal[1]) / self.focal[1];
+        let (x, y) = self.distortion.distort(x, y);
+        (x * self.focal[0] + self.principal[0], y * self.focal[1] + self.principal[1])
+    }
     /// Resamples one image, bilinearly and weighted by alpha.
     pub fn apply(&self, image: &Image8) -> Image8 {
         let c = image.channels as usize;
         let [width, height] = self.size;
         let mut data = vec![0u8; width as usize * height as usize * c];
         data.par_chunks_mut(width as usize * c).enumerate().for_each(|(row, line)| {
-            let y = (row as f64 + 0.5 + f64::from(self.origin[1]) - self.principal[1]) / self.focal[1];
             for (column, px) in line.chunks_exact_mut(c).enumerate() {
-                let x = (column as f64 + 0.5 + f64::from(self.origin[0]) - self.principal[0]) / self.focal[0];
-                let (xd, yd) = self.distortion.distort(x, y);
-                sample(image, xd * self.focal[0] + self.principal[0] - 0.5, yd * self.focal[1] + self.principal[1] - 0.5, px);
+                let (u, v) = self.source(column as f64 + 0.5, row as f64 + 0.5);
+                sample(image, u - 0.5, v - 0.5, px);
             }
         });
         Image8 { width, height, channels: image.channels, data }

@@ -2,7 +2,7 @@
 
 use super::watchdog::is_finite;
 use burn::tensor::Tensor;
-use cc4dgs_core::{Error, LossInput, LossTerm, Registry, Result, split_kind};
+use cc4dgs_core::{Error, LossInput, LossTerm, Registry, Result, Scene, split_kind};
 
 /// Loss terms with their weights.
 pub(crate) struct LossTerms(Vec<Term>);
@@ -43,6 +43,22 @@ impl LossTerms {
             terms.push(Term { name: term.kind.clone(), weight: term.weight, term: built });
         }
         Ok(Self(terms))
+    }
+    /// Whether a term compares recorded depth.
+    pub fn want_depth(&self) -> bool {
+        self.0.iter().any(|term| term.term.wants_depth())
+    }
+    /// Refuses terms that compare recorded depth where no training view of `scene` has it.
+    pub fn check_depth(&self, scene: &Scene) -> Result<()> {
+        let Some(Term { name, .. }) = self.0.iter().find(|term| term.term.wants_depth()) else { return Ok(()) };
+        if scene.has_depth()? {
+            return Ok(());
+        }
+        Err(Error::parameter(
+            format!("loss {name}"),
+            format!("it compares recorded depth, and no training view of {} has any", scene.name),
+            "Name the 16-bit PNG files of depth as depth_file_path in transforms.json, or remove the term",
+        ))
     }
     /// The weighted sum `[1]` for one view.
     pub fn value(&self, input: &LossInput) -> Result<Tensor<1>> {

@@ -214,6 +214,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     };
     let rasterizer = job.registry.build_rasterizer(&config.rasterizer)?;
     let losses = LossTerms::build(job.registry, &config.loss)?;
+    losses.check_depth(&job.scene)?;
     let score_loss = LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?;
     let mut state = match start {
         Start::Resumed(state) => *state,

@@ -3,7 +3,7 @@
 use crate::config::RunConfig;
 use crate::data::resize;
 use crate::schedule::IMAGE_SCALES;
-use cc4dgs_core::{FrameSource, Image8, Result, Scene};
+use cc4dgs_core::{DepthImage, FrameSource, Image8, Result, Scene};
 use std::sync::Arc;
 
 /// The scene at every size of images that a run uses.
@@ -33,12 +33,16 @@ impl Pyramid {
 
 /// `scene` with images of `scale` per axis. They are cached within the bound of `scene`.
 fn shrunk(scene: &Arc<Scene>, scale: f32) -> Result<Scene> {
-    let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
-    let cameras = scene.cameras.iter().map(|camera| camera.resized(side(camera.width), side(camera.height))).collect();
+    let cameras = scene.cameras.iter().map(|camera| camera.resized(side(camera.width, scale), side(camera.height, scale))).collect();
     scene.derived(cameras, Arc::new(Shrunk { scene: scene.clone(), scale }))
 }
 
-/// The images of a scene, smaller.
+/// `pixels` at a scale.
+fn side(pixels: u32, scale: f32) -> u32 {
+    ((pixels as f32 * scale).round() as u32).max(1)
+}
+
+/// The images of a scene and their depth, smaller.
 struct Shrunk {
     scene: Arc<Scene>,
     scale: f32,
@@ -47,8 +51,10 @@ struct Shrunk {
 impl FrameSource for Shrunk {
     fn load(&self, view: usize) -> Result<Image8> {
         let image = self.scene.frame(view)?;
-        let side = |pixels: u32| ((pixels as f32 * self.scale).round() as u32).max(1);
-        Ok(resize(&image, side(image.width), side(image.height)))
+        Ok(resize(&image, side(image.width, self.scale), side(image.height, self.scale)))
+    }
+    fn depth(&self, view: usize) -> Result<Option<DepthImage>> {
+        Ok(self.scene.depth(view)?.map(|depth| depth.resized(side(depth.width, self.scale), side(depth.height, self.scale))))
     }
 }
 
@@ -65,6 +71,9 @@ mod tests {
         fn load(&self, _: usize) -> Result<Image8> {
             self.0.fetch_add(1, Ordering::Relaxed);
             Ok(Image8 { width: 40, height: 20, channels: 3, data: vec![9; 2400] })
+        }
+        fn depth(&self, _: usize) -> Result<Option<DepthImage>> {
+            Ok(Some(DepthImage { width: 40, height: 20, values: (0..800).map(|pixel| if pixel % 2 == 0 { 0.0 } else { 3.0 }).collect() }))
         }
     }
 
@@ -106,6 +115,9 @@ mod tests {
             let image = level.frame(0).unwrap();
             assert_eq!((image.width, image.height), (level.cameras[0].width, level.cameras[0].height));
             assert_eq!(image.width, (40.0 * scale).round() as u32);
+            let depth = level.depth(0).unwrap().unwrap();
+            assert_eq!((depth.width, depth.height), (image.width, image.height));
+            assert!(depth.values.iter().all(|z| [0.0, 3.0].contains(z)), "known and unknown pixels are not mixed: {:?}", depth.values);
         }
         config.train.image_growth = 0.0;
         assert_eq!(Pyramid::new(&scene, &config).unwrap().at(0.25).cameras[0].width, 40);

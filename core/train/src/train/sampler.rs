@@ -65,17 +65,20 @@ impl Sampler {
     }
 }
 
-/// Decodes coming frames into the cache of their scene on a thread of its own.
+/// Decodes coming frames, and their depth where it is used, into the cache of their scene on a thread of its own.
 pub struct Prefetcher(SyncSender<(Arc<Scene>, usize)>);
 
 impl Prefetcher {
     /// Starts the thread; it ends with this value.
-    pub fn new() -> Self {
+    pub fn new(uses_depth: bool) -> Self {
         let (send, receive) = sync_channel::<(Arc<Scene>, usize)>(16);
         std::thread::spawn(move || {
             for (scene, view) in receive {
-                // A frame that cannot be read is reported by whoever needs it.
+                // What cannot be read is reported by whoever needs it.
                 let _ = scene.frame(view);
+                if uses_depth {
+                    let _ = scene.depth(view);
+                }
             }
         });
         Self(send)

@@ -43,7 +43,7 @@ impl Context<'_> {
         let began = Instant::now();
         let mut sampler = self.sampler(&first);
         let mut pace = Pace::new(self, stage, state);
-        let prefetcher = Prefetcher::new();
+        let prefetcher = Prefetcher::new(self.losses.want_depth());
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
         let mut log = Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);

@@ -10,11 +10,11 @@ use super::smoothness::{flicker, smoothness};
 use super::watchdog::{TOLERATED, Trouble, broken_rows_of, is_finite};
 use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
-use burn::tensor::{Gradients, Int, Tensor};
+use burn::tensor::{Gradients, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, DeformerWork, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings,
-    ViewStatistics,
+    Camera, DeformerWork, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Scene, Schedule, SpatialInput, Splats, Stage, Statistic,
+    StepSettings, ViewStatistics,
 };
 use cc4dgs_play::MovingRows;
 use cc4dgs_play::model::ModelDeformer;
@@ -146,7 +146,9 @@ impl Context<'_> {
             let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
             let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
             let radii = output.stats.radii;
+            let depth = self.recorded_depth(scene, view)?;
             let input = LossInput::new(camera, &scene.views[view], &planes, &target, &drawn, &radii, schedule).moved_from(&gaussians);
+            let input = input.with_depth(depth.as_ref());
             let loss = self.losses.value(&input)?;
             if (read || check) && !is_finite(&loss, "loss")? {
                 let part = if is_finite(&planes, "image")? { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
@@ -249,6 +251,16 @@ impl Context<'_> {
         parameters::update("appearance/", appearance.parameters_mut(), ExactWeights::default(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         log.step(self.job.events, schedule.iteration, state.set.len());
         Ok(Outcome::Stepped)
+    }
+
+    /// The recorded depth `[1,H,W]` of a view, where a loss term compares it and the view has it.
+    fn recorded_depth(&self, scene: &Scene, view: usize) -> Result<Option<Tensor<3>>> {
+        if !self.losses.want_depth() {
+            return Ok(None);
+        }
+        let Some(depth) = scene.depth(view)? else { return Ok(None) };
+        let data = TensorData::new(depth.values.clone(), [1, depth.height as usize, depth.width as usize]);
+        Ok(Some(Tensor::from_inner(Tensor::from_data(data, &self.device))))
     }
 
     /// One optimizer step of the Gaussians' attributes that have a gradient.

@@ -7,7 +7,7 @@
 use super::tune::TuneJob;
 use crate::config::RunConfig;
 use crate::sample::spread;
-use cc4dgs_core::{Error, Event, FrameSource, Image8, Result, Scene, Split, config};
+use cc4dgs_core::{DepthImage, Error, Event, FrameSource, Image8, Result, Scene, Split, config};
 use cc4dgs_play::{Model, Player};
 use glam::{DMat3, DMat4, DVec3, DVec4};
 use std::collections::BTreeMap;
@@ -130,6 +130,9 @@ impl FrameSource for Recoloured {
             (0..3).for_each(|k| planes[k * pixels + at] = map[k].dot(colour) as f32);
         }
         Ok(Image8::from_planes(&planes, image.width, image.height))
+    }
+    fn depth(&self, view: usize) -> Result<Option<DepthImage>> {
+        Ok(self.scene.depth(view)?.map(|depth| depth.as_ref().clone()))
     }
 }
 

@@ -23,6 +23,12 @@ pub fn write_image(path: &Path, width: u32, height: u32, marker: u8) {
     pixels.save(path).unwrap();
 }
 
+/// A depth image whose pixel (x, y) has `steps(x, y)`.
+pub fn write_depth(path: &Path, width: u32, height: u32, steps: impl Fn(u32, u32) -> u16) {
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    image::ImageBuffer::from_fn(width, height, |x, y| image::Luma([steps(x, y)])).save(path).unwrap();
+}
+
 pub fn write_rgba_image(path: &Path, width: u32, height: u32, pixel: [u8; 4]) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     image::RgbaImage::from_pixel(width, height, image::Rgba(pixel)).save(path).unwrap();

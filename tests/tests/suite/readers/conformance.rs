@@ -19,6 +19,9 @@ fn tiny(name: &str, root: &Path) -> PathBuf {
         "llff" => write_llff(root),
         "nerfstudio" => {
             write_nerfstudio(root, 4);
+            write_depth(&root.join("depth.png"), 8, 6, |x, y| (x * y) as u16);
+            let document = std::fs::read_to_string(root.join("transforms.json")).unwrap();
+            std::fs::write(root.join("transforms.json"), document.replacen("\"file_path\"", "\"depth_file_path\":\"depth.png\",\"file_path\"", 1)).unwrap();
         }
         "technicolor" => {
             write_technicolor(root, 12, &[100, 101]);

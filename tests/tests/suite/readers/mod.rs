@@ -5,6 +5,7 @@ mod colmap;
 pub mod common;
 mod conformance;
 mod course;
+mod depth;
 mod first_points;
 mod formats;
 mod golden;

@@ -17,6 +17,8 @@ pub struct LossValues<'a> {
     pub planes: &'a [f32],
     /// Recorded planes `[3,H,W]`, the first of which also serves as the mask.
     pub target: &'a [f32],
+    /// Recorded depth `[H,W]`, 0 where it is unknown.
+    pub depth: &'a [f32],
     /// H and W.
     pub size: [usize; 2],
     /// One Gaussian or more.
@@ -39,12 +41,27 @@ impl LossValues<'_> {
 type Term = fn(&LossValues) -> f64;
 
 /// The terms that have formulas, by name.
-pub const TERMS: [(&str, Term); 7] =
-    [("dssim", dssim), ("l1", l1), ("mask-bce", mask_bce), ("mse", mse), ("opacity", opacity), ("photometric", photometric), ("scale", scale)];
+pub const TERMS: [(&str, Term); 8] = [
+    ("depth", depth),
+    ("dssim", dssim),
+    ("l1", l1),
+    ("mask-bce", mask_bce),
+    ("mse", mse),
+    ("opacity", opacity),
+    ("photometric", photometric),
+    ("scale", scale),
+];
 
 /// The value of the term called `name`; `None` where there is no formula of it.
 pub fn value(name: &str, input: &LossValues) -> Option<f64> {
     TERMS.into_iter().find(|(known, _)| *known == name).map(|(_, term)| term(input))
+}
+
+/// Mean difference of the fifth plane and the depth that the fourth, alpha, leaves of the recorded one, over the recorded one where it is known.
+fn depth(input: &LossValues) -> f64 {
+    let plane = |index: usize| input.planes[index * input.pixels()..].iter().map(|v| f64::from(*v));
+    let known = plane(3).zip(plane(4)).zip(input.depth).filter(|(_, d)| **d > 0.0);
+    mean(known.map(|((alpha, z), d)| (z - alpha * f64::from(*d)).abs() / f64::from(*d)))
 }
 
 fn l1(input: &LossValues) -> f64 {
@@ -118,7 +135,7 @@ mod tests {
     fn values_of_one_pixel_are_those_by_hand() {
         let gaussians = HostGaussians { log_scales: vec![0.0; 3], opacity_logits: vec![0.0], ..Default::default() };
         let of = |planes: &[f32], name: &str| {
-            let input = LossValues { planes, target: &[0.0; 3], size: [1, 1], gaussians: &gaussians, extent: 2.0 };
+            let input = LossValues { planes, target: &[0.0; 3], depth: &[2.0], size: [1, 1], gaussians: &gaussians, extent: 2.0 };
             value(name, &input).unwrap()
         };
         // 1 over the sum of exp(-k² / 4.5), k from -5 to 5, is 0.266; the window has its square at the centre. Of the channels, one is a 1 beside a 0.
@@ -127,13 +144,14 @@ mod tests {
         let planes = [1.0f32, 0.0, 0.0, 7.0, 7.0];
         let dssim = (1.0 - lonely) / 3.0;
         let softplus = 1.0f64.exp().ln_1p();
-        let wanted = [dssim, 1.0 / 3.0, softplus, 1.0 / 3.0, 0.5, 0.8 / 3.0 + 0.2 * dssim, 0.5];
+        // Alpha times depth is 14, and 7 was rendered.
+        let wanted = [3.5, dssim, 1.0 / 3.0, softplus, 1.0 / 3.0, 0.5, 0.8 / 3.0 + 0.2 * dssim, 0.5];
         for ((name, _), wanted) in TERMS.into_iter().zip(wanted) {
             assert!((of(&planes, name) - wanted).abs() < 1e-6, "{name}: {} instead of {wanted}", of(&planes, name));
         }
         let gray = [0.5f32; 3];
         assert!(of(&[0.0; 3], "dssim").abs() < 1e-12 && (of(&gray, "l1") - 0.5).abs() < 1e-12 && (of(&gray, "mse") - 0.25).abs() < 1e-12);
-        let input = LossValues { planes: &gray, target: &gray, size: [1, 1], gaussians: &gaussians, extent: 2.0 };
+        let input = LossValues { planes: &gray, target: &gray, depth: &[2.0], size: [1, 1], gaussians: &gaussians, extent: 2.0 };
         assert!(value("no such term", &input).is_none());
     }
 }

@@ -2,7 +2,8 @@
 
 use super::{NAMES, ProceduralScene, Sensor, Viewpoint};
 use cc4dgs_core::{
-    Distortion, Error, FrameSource, Image8, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, inventory,
+    DepthImage, Distortion, Error, FrameSource, Image8, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result,
+    SceneOptions, inventory,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -107,6 +108,10 @@ impl FrameSource for TracedFrames {
             Image8 { width: camera.width, height: camera.height, channels: 3, data }
         };
         Ok(self.sensors[viewpoint].distortion.is_identity().then(mask))
+    }
+    fn depth(&self, index: usize) -> Result<Option<DepthImage>> {
+        let (viewpoint, frame) = self.taken(index)?;
+        Ok(Some(self.sensors[viewpoint].depth(&self.scene.tracer(self.scene.time(frame)), &self.viewpoints[viewpoint].camera)))
     }
 }
 

@@ -1,7 +1,7 @@
 //! What a camera makes of the light: lens, exposure, white balance and noise.
 
-use super::trace::{PixelRays, Tracer, quantised};
-use cc4dgs_core::{Camera, Distortion, Image8, Seed, Split};
+use super::trace::{PixelRays, Ray, Tracer, quantised};
+use cc4dgs_core::{Camera, DepthImage, Distortion, Image8, Seed, Split};
 use glam::DVec3;
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -40,15 +40,7 @@ impl Sensor {
 
     /// The image of `camera` with this lens and sensor. `seed` is for the noise of this image.
     pub fn image(&self, tracer: &Tracer, camera: &Camera, supersampling: u32, seed: Seed) -> Image8 {
-        let rays = PixelRays::new(camera);
-        let ideal = |u: f64, v: f64| rays.through(u, v);
-        let bent = |u: f64, v: f64| {
-            let (x, y) = ((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy);
-            let (x, y) = self.distortion.undistort(x, y).unwrap_or((x, y));
-            ideal(x * camera.fx + camera.cx, y * camera.fy + camera.cy)
-        };
-        let ray: &(dyn Fn(f64, f64) -> (DVec3, DVec3) + Sync) = if self.distortion.is_identity() { &ideal } else { &bent };
-        let mut colors = tracer.trace([camera.width, camera.height], supersampling, ray);
+        let mut colors = self.with_rays(camera, |ray| tracer.trace([camera.width, camera.height], supersampling, ray));
         if self.gain != [1.0; 3] {
             colors.iter_mut().for_each(|c| *c = std::array::from_fn(|k| (c[k] * self.gain[k]).min(1.0)));
         }
@@ -61,6 +53,22 @@ impl Sensor {
             }
         }
         quantised(camera.width, camera.height, &colors)
+    }
+    /// The depth at the centres of the pixels of [`Sensor::image`], in the unit of the cameras; 0 where no object is.
+    pub fn depth(&self, tracer: &Tracer, camera: &Camera) -> DepthImage {
+        let values = self.with_rays(camera, |ray| tracer.depths([camera.width, camera.height], DVec3::from(camera.forward_world()), ray));
+        DepthImage { width: camera.width, height: camera.height, values }
+    }
+    /// Calls `work` with the rays of `camera` behind this lens, by pixel coordinates.
+    fn with_rays<T>(&self, camera: &Camera, work: impl FnOnce(&Ray) -> T) -> T {
+        let rays = PixelRays::new(camera);
+        let ideal = |u: f64, v: f64| rays.through(u, v);
+        let bent = |u: f64, v: f64| {
+            let (x, y) = ((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy);
+            let (x, y) = self.distortion.undistort(x, y).unwrap_or((x, y));
+            ideal(x * camera.fx + camera.cx, y * camera.fy + camera.cy)
+        };
+        if self.distortion.is_identity() { work(&ideal) } else { work(&bent) }
     }
 }
 

@@ -55,6 +55,9 @@ pub struct Tracer {
     unit: Similarity,
 }
 
+/// World origin and unit direction of the ray at pixel coordinates (u, v).
+pub type Ray<'a> = dyn Fn(f64, f64) -> (DVec3, DVec3) + Sync + 'a;
+
 /// The rays of a pinhole camera.
 pub(super) struct PixelRays<'a> {
     camera: &'a Camera,
@@ -96,6 +99,18 @@ impl Tracer {
             })
             .collect()
     }
+    /// How far the surface at the centre of every pixel is from the eye along `forward`, a unit vector; 0 where there is none. Row by row, for an image of
+    /// `size` pixels.
+    pub fn depths(&self, size: [u32; 2], forward: DVec3, ray: &Ray) -> Vec<f32> {
+        let [width, height] = size;
+        (0..height * width)
+            .into_par_iter()
+            .map(|i| {
+                let (origin, direction) = ray(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
+                self.hit(origin, direction).map_or(0.0, |hit| (hit.distance * direction.dot(forward)) as f32)
+            })
+            .collect()
+    }
     /// Colour of a hit seen along `direction`: ambient, Lambert and a mild highlight of one distant light. No shadows, so that what stands still looks still.
     pub fn shade(&self, hit: &Hit, direction: DVec3) -> [f64; 3] {
         let metric = Hit { point: self.metres(hit.point), ..*hit };
@@ -103,7 +118,7 @@ impl Tracer {
     }
     /// The colours 0..1 of an image of `size` pixels with `supersampling` x `supersampling` rays per pixel on a regular grid, row by row. `ray` gives world
     /// origin and unit direction at pixel coordinates (u, v).
-    pub fn trace(&self, size: [u32; 2], supersampling: u32, ray: &(dyn Fn(f64, f64) -> (DVec3, DVec3) + Sync)) -> Vec<[f64; 3]> {
+    pub fn trace(&self, size: [u32; 2], supersampling: u32, ray: &Ray) -> Vec<[f64; 3]> {
         let [width, height] = size;
         let n = supersampling.max(1);
         let offset = |i: u32| (f64::from(i) + 0.5) / f64::from(n);
