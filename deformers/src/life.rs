@@ -5,8 +5,8 @@ use burn::tensor::Tensor;
 use cc4dgs_backends::ops::life::{LifeAt, WIDTH};
 use cc4dgs_backends::ops::split::split;
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerLayerPlugin, DeformerWork, Error, LIFE_ATTRIBUTES, Offsets, Parameter, ParameterGroup, Plugin, Result, Simplified,
-    SpatialFeatures, SpatialInput, config, inventory,
+    AttributeSpec, Deformer, DeformerLayerPlugin, DeformerWork, Error, HostGaussians, LIFE_ATTRIBUTES, Offsets, Parameter, ParameterGroup, Plugin, Result,
+    Simplified, SpatialFeatures, SpatialInput, config, inventory,
 };
 
 /// The key of a `[deformer]` section.
@@ -125,6 +125,9 @@ impl Deformer for WithLife {
             (Some(a), Some(b)) => Some(a + b),
             (a, b) => a.or(b),
         })
+    }
+    fn start_from(&mut self, first: &HostGaussians) -> Result<()> {
+        self.inner.start_from(first)
     }
     fn set_progress(&mut self, progress: f32) {
         self.inner.set_progress(progress);

@@ -2,7 +2,7 @@
 
 use crate::gaussians::{CORE_ATTRIBUTES, first_rows};
 use crate::storage::value_count;
-use crate::{DeformerContext, Error, Offsets, Plugin, Result};
+use crate::{DeformerContext, Error, HostGaussians, Offsets, Plugin, Result};
 use burn::tensor::{Device, Int, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -216,6 +216,24 @@ pub fn check_parameters(owner: &str, parameters: &[&Parameter], groups: &[Parame
     Ok(())
 }
 
+/// Calls [`Deformer::start_from`] of a new deformer, as a training does. `name` is the deformer's in errors.
+///
+/// # Errors
+/// [`Error::Parameter`] where the weights do not have the names and shapes that they had before, and what the deformer reports.
+pub fn start_deformer(name: &str, deformer: &mut dyn Deformer, first: &HostGaussians) -> Result<()> {
+    fn shapes(deformer: &dyn Deformer) -> Vec<(String, Vec<usize>)> {
+        deformer.parameters().into_iter().map(|p| (p.name.clone(), p.shape.clone())).collect()
+    }
+    let (owner, before) = (format!("deformer {name}"), shapes(deformer));
+    deformer.start_from(first)?;
+    check_parameters(&owner, &deformer.parameters(), &deformer.groups())?;
+    if shapes(deformer) == before {
+        return Ok(());
+    }
+    let remedy = "Let them depend on settings and context alone: stored models are opened without the first Gaussians";
+    Err(Error::parameter(owner, "start_from changed the names or shapes of weights", remedy))
+}
+
 /// A deformer (deformation field): from canonical Gaussians to offsets at a time (paper Section IV-B).
 ///
 /// The time-invariant half is a separate call, so that playback can cache it. Training recomputes it every step.
@@ -261,6 +279,14 @@ pub trait Deformer: Send {
     /// [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
+    }
+    /// Sets initial weights that depend on the first Gaussians, such as control points. A training calls it once, on a new deformer before the main stage; stored
+    /// models are opened without it, and their weights are replaced by name. So it may change nothing but values of weights: their names and shapes depend on
+    /// settings and context alone, whatever the number of Gaussians. `first` are those that may move, or all if none may: there may be few, or none, all values are
+    /// finite, and attributes of plug-ins may be missing. Equal Gaussians must give equal weights: draw random numbers from [`DeformerContext::seed`].
+    /// Default: nothing.
+    fn start_from(&mut self, _first: &HostGaussians) -> Result<()> {
+        Ok(())
     }
     /// Sets the progress of the main stage of training, 0..1; called before every step. A deformer without such a call has progress 1, as after training.
     fn set_progress(&mut self, _progress: f32) {}

@@ -5,7 +5,7 @@
 
 use crate::Plugin;
 use crate::gaussians::to_vec;
-use crate::{Error, Gaussians, Result, Schedule, Seed};
+use crate::{Camera, Error, Gaussians, Result, Schedule, Seed, View};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
 /// A statistic that the rasterizer collects only on request.
@@ -19,9 +19,16 @@ pub enum Statistic {
     MaxWeight,
 }
 
-/// Statistics of N Gaussians in one rendered view. Fields that were not requested are `None`.
+/// Statistics of N Gaussians in one rendered view. Fields that were not requested are `None`. More may be added to it, so programs make one with
+/// [`ViewStatistics::new`].
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ViewStatistics {
+    /// The camera of the view, at the size of the image. Its name is that of the dataset.
+    pub camera: Camera,
+    /// The view: the index of its camera, its frame among those that the scene has, counted from 0, and its time. With `train.time_noise` the Gaussians were
+    /// drawn at a time nearby.
+    pub view: View,
     /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
     pub radii: Tensor<1, Int>,
     /// [`Statistic::ScreenGradient`] per pixel of x and y `[N,2]`.
@@ -34,6 +41,14 @@ pub struct ViewStatistics {
     pub size: (u32, u32),
     /// Number of views of this iteration. The loss of the gradients was divided by it.
     pub views: usize,
+}
+
+impl ViewStatistics {
+    /// The only view of an iteration, without what is collected on request: set those fields, and [`ViewStatistics::views`], where there is more.
+    pub fn new(camera: Camera, view: View, radii: Tensor<1, Int>) -> Self {
+        let size = (camera.width, camera.height);
+        Self { camera, view, radii, screen_gradient: None, absolute_screen_gradient: None, max_weights: None, size, views: 1 }
+    }
 }
 
 /// Counts of a plan's actions, for events.

@@ -46,7 +46,7 @@ pub use cc4dgs_format::{
 };
 pub use deformer::{
     AttributeSpec, BuildLayer, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures,
-    SpatialInput, check_attributes, check_parameters,
+    SpatialInput, check_attributes, check_parameters, start_deformer,
 };
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
 pub use depth::DepthImage;

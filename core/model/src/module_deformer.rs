@@ -4,12 +4,14 @@
 //! as flat arrays and calls the author's functions with a module that has the current weights. So a new deformer consists of its layers, two functions and a
 //! registration.
 
-use crate::{AttributeSpec, Deformer, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures, SpatialInput};
+use crate::{AttributeSpec, Deformer, DeformerWork, Error, HostGaussians, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures, SpatialInput};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
 /// A loss term of a module: module, input, normalised time, progress.
 type Regularizer<M> = Box<dyn Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send>;
+/// The module with initial weights that depend on the first Gaussians.
+type Start<M> = Box<dyn Fn(M, &HostGaussians) -> Result<M> + Send>;
 /// Changes a module, except for its weights, as training advances.
 type Progress<M> = Box<dyn Fn(&mut M, f32) + Send>;
 
@@ -24,6 +26,7 @@ pub struct ModuleDeformer<M, S, D> {
     groups: Vec<ParameterGroup>,
     attributes: Vec<AttributeSpec>,
     regularizer: Option<Regularizer<M>>,
+    start: Option<Start<M>>,
     progress: Option<Progress<M>>,
     cached: bool,
     /// Beginnings of paths that were asked for and that no weight has.
@@ -39,16 +42,16 @@ where
     /// A deformer whose weights are all float weights of `module`, in one optimizer group and counted as network. Names are paths of the module tree
     /// (`trunk.0.weight`). Errors name the deformer by the name of `group`.
     pub fn new(module: M, group: ParameterGroup, spatial: S, deform: D) -> Self {
-        let mut list = Collector { path: Vec::new(), parameters: Vec::new() };
-        module.visit(&mut list);
+        let parameters = Collector::of(&module);
         Self {
             module,
             spatial,
             deform,
-            parameters: list.parameters,
+            parameters,
             groups: vec![group],
             attributes: Vec::new(),
             regularizer: None,
+            start: None,
             progress: None,
             cached: true,
             unmatched: Vec::new(),
@@ -62,6 +65,12 @@ where
     /// Adds a loss term `[1]`: `term(module, input, time_norm, progress)`.
     pub fn with_regularizer(mut self, term: impl Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send + 'static) -> Self {
         self.regularizer = Some(Box::new(term));
+        self
+    }
+    /// Sets initial weights that depend on the first Gaussians: `start(module, first)` returns the module with weights of the same shapes. Nothing else of it is
+    /// kept; see [`Deformer::start_from`].
+    pub fn with_start(mut self, start: impl Fn(M, &HostGaussians) -> Result<M> + Send + 'static) -> Self {
+        self.start = Some(Box::new(start));
         self
     }
     /// Calls `change(module, progress)` before every training step, with progress in 0..1. It may change anything except weights.
@@ -133,6 +142,14 @@ where
     fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         self.regularizer.as_ref().map_or(Ok(None), |term| term(&self.current(), input, time_norm, progress))
     }
+    fn start_from(&mut self, first: &HostGaussians) -> Result<()> {
+        let Some(start) = &self.start else { return Ok(()) };
+        let started = Collector::of(&start(self.current(), first)?);
+        for (to, from) in self.parameters.iter_mut().zip(started) {
+            (to.shape, to.value) = (from.shape, from.value);
+        }
+        Ok(())
+    }
     fn set_progress(&mut self, progress: f32) {
         if let Some(change) = &self.progress {
             change(&mut self.module, progress);
@@ -159,6 +176,14 @@ where
 struct Collector {
     path: Vec<String>,
     parameters: Vec<Parameter>,
+}
+
+impl Collector {
+    fn of(module: &impl Module) -> Vec<Parameter> {
+        let mut list = Self { path: Vec::new(), parameters: Vec::new() };
+        module.visit(&mut list);
+        list.parameters
+    }
 }
 
 impl ModuleVisitor for Collector {
@@ -198,6 +223,7 @@ impl ModuleMapper for Assigner<'_> {
 mod tests {
     use super::*;
     use crate::gaussians::to_vec;
+    use crate::start_deformer;
     use burn::tensor::Device;
 
     #[derive(Module, Debug)]
@@ -245,6 +271,28 @@ mod tests {
         // d/dV = features^T 1 t: two Gaussians, each with feature 1.5, half way through time.
         let gradient = field.parameters()[1].value.grad(&gradients).unwrap();
         assert_eq!(to_vec(gradient, "gradient").unwrap(), vec![1.5; 9]);
+    }
+
+    #[test]
+    fn weights_start_from_the_first_gaussians() {
+        let device = Device::flex();
+        let started = |rows: usize| {
+            let param = || Param::from_tensor(Tensor::<2>::ones([3, 3], &device));
+            let spatial = |m: &Drift, input: &SpatialInput| Ok(input.means_world.clone().matmul(m.table.val()));
+            let deform = |m: &Drift, features: Tensor<2>, t: f32| Ok(Offsets { means: Some(features.matmul(m.velocity.val()) * t), ..Offsets::default() });
+            let start = move |module: Drift, first: &HostGaussians| {
+                let table = Tensor::<2>::full([rows, 3], first.len() as f32, &module.table.val().device());
+                Ok(Drift { table: Param::from_tensor(table), ..module })
+            };
+            let group = ParameterGroup::plain("drift", 1e-3, 1e-4);
+            let mut field = ModuleDeformer::new(Drift { table: param(), velocity: param() }, group, spatial, deform).with_start(start);
+            let first = HostGaussians { means: vec![0.0; 21], opacity_logits: vec![0.0; 7], ..Default::default() };
+            start_deformer("drift", &mut field, &first)?;
+            field.parameters().into_iter().map(|p| to_vec(p.value.clone(), &p.name)).collect::<Result<Vec<_>>>()
+        };
+        assert_eq!(started(3).unwrap(), [vec![7.0; 9], vec![1.0; 9]]);
+        let error = started(4).unwrap_err().to_string();
+        assert!(error.contains("deformer drift") && error.contains("shapes"), "{error}");
     }
 
     #[test]

@@ -3,12 +3,13 @@
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
 use cc4dgs_core::{
-    DensityControl, DensityPlan, DensityPlugin, Event, Gaussians, HostGaussians, Plugin, Recorder, Registry, Result, Schedule, Seed, Split, Stage, Statistic,
-    ViewStatistics, config, inventory,
+    Camera, DensityControl, DensityPlan, DensityPlugin, Event, Gaussians, HostGaussians, Plugin, Recorder, Registry, Result, Schedule, Seed, Split, Stage,
+    Statistic, View, ViewStatistics, config, inventory,
 };
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::eval::{Scored, evaluate};
 use cc4dgs_train::train::{TrainJob, train};
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
@@ -31,6 +32,8 @@ struct Done {
     /// Rounds that removed more than their share.
     excesses: AtomicUsize,
     resets: AtomicUsize,
+    /// Whose statistics it received.
+    seen: Mutex<Vec<(Camera, View)>>,
 }
 
 /// By what the control does, the latest training last.
@@ -63,6 +66,9 @@ impl DensityControl for Hostile {
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
         let radii = view.radii.clone().float().into_data().to_vec::<f32>().unwrap();
         self.views.iter_mut().zip(radii).for_each(|(views, radius)| *views += f32::from(radius > 0.0));
+        if let Some(done) = &self.done {
+            done.seen.lock().unwrap().push((view.camera.clone(), view.view.clone()));
+        }
         Ok(())
     }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, _: Seed) -> Result<Option<DensityPlan>> {
@@ -174,7 +180,7 @@ fn run(does: &str, iterations: usize) -> Run {
         _ => None,
     });
     let run = Run { done, begun: begun.unwrap(), ended: model.gaussians.len(), psnr_db, notes: notes.collect() };
-    let Done { added, removed, young, excesses, resets } = &*run.done;
+    let Done { added, removed, young, excesses, resets, .. } = &*run.done;
     let counts = [added, removed, young, excesses, resets].map(|count| count.load(SeqCst));
     println!("'{does}', {iterations} iterations: {} Gaussians became {}, {psnr_db:.2} dB, counts {counts:?}, {} notes", run.begun, run.ended, run.notes.len());
     run
@@ -202,6 +208,17 @@ fn hostile_controls_do_not_take_a_training_apart() {
             }
         }
     }
+}
+
+#[test]
+fn controls_know_the_camera_and_the_time_of_a_view() {
+    let (registry, config) = (Registry::collect().unwrap(), configured("look", 30));
+    let scene = cc4dgs_train::data::open(Path::new("procedural:tiny"), &config.scene, &registry, &config.limits).unwrap();
+    let run = run("look", 30);
+    let seen = run.done.seen.lock().unwrap();
+    assert!(seen.iter().all(|(camera, view)| scene.views.contains(view) && scene.cameras[view.camera] == *camera), "{seen:?}");
+    let (cameras, frames): (BTreeSet<usize>, BTreeSet<usize>) = seen.iter().map(|(_, view)| (view.camera, view.frame)).unzip();
+    assert!(cameras.len() > 1 && frames.len() > 1, "{cameras:?}, {frames:?}");
 }
 
 #[test]
@@ -247,14 +264,19 @@ fn view(count: usize, wanted: &[Statistic], seed: Seed, device: &Device) -> View
     let gradients: Vec<f32> = (0..2 * count).map(|k| if (k / 2).is_multiple_of(30) { 2e-5 } else { 1e-8 } * uniform(seed, count + k)).collect();
     let weights: Vec<f32> = (0..count).map(|row| uniform(seed, 3 * count + row)).collect();
     let gradient = |statistic| wanted.contains(&statistic).then(|| Tensor::<2>::from_data(TensorData::new(gradients.clone(), [count, 2]), device));
-    ViewStatistics {
-        radii: Tensor::<1, Int>::from_data(TensorData::new(radii, [count]), device),
-        screen_gradient: gradient(Statistic::ScreenGradient),
-        absolute_screen_gradient: gradient(Statistic::AbsoluteScreenGradient),
-        max_weights: wanted.contains(&Statistic::MaxWeight).then(|| Tensor::from_data(TensorData::new(weights, [count]), device)),
-        size: (640, 360),
-        views: 1,
-    }
+    statistics(radii, gradient, wanted.contains(&Statistic::MaxWeight).then_some(weights), device)
+}
+
+/// Statistics of a view of 640x360 pixels in which Gaussians have these radii, gradients and largest weights.
+pub(super) fn statistics(radii: Vec<i64>, gradient: impl Fn(Statistic) -> Option<Tensor<2>>, weights: Option<Vec<f32>>, device: &Device) -> ViewStatistics {
+    let count = radii.len();
+    let camera = Camera::look_at("test", (640, 360), 1.0, [0.0, -4.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
+    let view = View { camera: 0, frame: 0, time_norm: 0.0, split: Split::Train };
+    let mut seen = ViewStatistics::new(camera, view, Tensor::<1, Int>::from_data(TensorData::new(radii, [count]), device));
+    seen.screen_gradient = gradient(Statistic::ScreenGradient);
+    seen.absolute_screen_gradient = gradient(Statistic::AbsoluteScreenGradient);
+    seen.max_weights = weights.map(|weights| Tensor::from_data(TensorData::new(weights, [count]), device));
+    seen
 }
 
 /// The number of Gaussians after each plan of a control over coarse and main stage. After every plan one in a hundred fades.

@@ -17,6 +17,7 @@ mod columns;
 mod conformance;
 mod depth;
 mod end_to_end;
+mod first_gaussians;
 mod fresh_cases;
 mod golden_codec;
 mod golden_geometry;

@@ -129,6 +129,81 @@ fn mistakes_are_found() {
     assert!(found.contains("schema"), "a schema that is not the default's TOML:\n{found}");
 }
 
+/// The error in [`Anchored`].
+#[derive(Clone, Copy, PartialEq)]
+enum StartMistake {
+    None,
+    /// Part of what was learned from the first Gaussians is not in the weights.
+    Hidden,
+    /// An array has as many rows as there are Gaussians.
+    GrownArray,
+    /// The mean of no Gaussians.
+    NotFinite,
+}
+
+/// Moves everything along the mean of the first Gaussians.
+struct Anchored {
+    mistake: StartMistake,
+    parameters: Vec<Parameter>,
+    hidden: f32,
+}
+
+impl Deformer for Anchored {
+    fn start_from(&mut self, first: &HostGaussians) -> Result<()> {
+        let divisor = if self.mistake == StartMistake::NotFinite { first.len() } else { first.len().max(1) } as f32;
+        let mean: Vec<f32> = (0..3).map(|k| first.means.iter().skip(k).step_by(3).sum::<f32>() / divisor).collect();
+        let anchor = &mut self.parameters[0];
+        anchor.value = Tensor::from_floats(mean.as_slice(), &anchor.value.device());
+        if self.mistake == StartMistake::GrownArray {
+            (anchor.shape, anchor.value) = (vec![first.len() + 1, 3], anchor.value.clone().repeat_dim(0, first.len() + 1));
+        }
+        if self.mistake == StartMistake::Hidden {
+            self.hidden = first.len() as f32;
+        }
+        Ok(())
+    }
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        Ok(SpatialFeatures { values: input.means_world.zeros_like(), work: DeformerWork::default() })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        if !time_norm.is_finite() {
+            return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
+        }
+        let along = self.parameters[0].value.clone().narrow(0, 0, 3).reshape([1, 3]);
+        Ok(Offsets { means: Some(features + along * (time_norm * (1.0 + self.hidden))), ..Offsets::default() })
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        vec![ParameterGroup::plain("anchor", 1e-3, 1e-3)]
+    }
+}
+
+fn build_anchored(mistake: StartMistake, settings: &toml::Table, device: &Device) -> Result<Box<dyn Deformer>> {
+    let NoSettings {} = cc4dgs_core::config::parse_section("deformer anchored", settings)?;
+    let anchor = Parameter { name: "anchor".into(), part: Part::Net, shape: vec![3], value: Tensor::zeros([3], device), group: 0 };
+    Ok(Box::new(Anchored { mistake, parameters: vec![anchor], hidden: 0.0 }))
+}
+
+#[test]
+fn mistakes_with_the_first_gaussians_are_found() {
+    let cases: [(Build, &str); 4] = [
+        (|settings, _, device| build_anchored(StartMistake::None, settings, device), ""),
+        (|settings, _, device| build_anchored(StartMistake::Hidden, settings, device), "a deformer with the same weights gives other offsets"),
+        (|settings, _, device| build_anchored(StartMistake::GrownArray, settings, device), "start_from changed the names or shapes of weights"),
+        (|settings, _, device| build_anchored(StartMistake::NotFinite, settings, device), "offsets are not finite where start_from had 0 Gaussians"),
+    ];
+    for (build, wanted) in cases {
+        let info = Plugin { name: "anchored", version: "1", summary: "a test", paper: "", schema: "# no settings\n", capabilities: &[] };
+        let found = conformance::deformer(&DeformerPlugin { info, build }, &toml::Table::new(), &Device::flex()).join("\n");
+        assert!(found.contains(wanted) && found.is_empty() == wanted.is_empty(), "expected '{wanted}' among:\n{found}");
+    }
+}
+
 #[test]
 fn schemas_that_do_not_state_the_defaults_are_found() {
     let (registry, none, flex) = (Registry::collect().unwrap(), toml::Table::new(), Device::flex());

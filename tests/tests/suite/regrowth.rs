@@ -1,7 +1,7 @@
 //! That growth and pruning do not undo each other: controls that are at their bound, driven by statistics over short and long schedules.
 
-use super::guard::{gaussians, uniform};
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use super::guard::{gaussians, statistics, uniform};
+use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityControl, Gaussians, Registry, Result, Schedule, Seed, Stage, Statistic, ViewStatistics};
 
@@ -43,14 +43,7 @@ fn view(set: &Gaussians, wanted: &[Statistic], seed: Seed, device: &Device) -> R
     let size = |row: usize| if row.is_multiple_of(3) && !covered(row) { 2e-5 } else { 1e-8 };
     let gradients: Vec<f32> = (0..2 * count).map(|k| size(k / 2) * uniform(seed, count + k)).collect();
     let gradient = |statistic| wanted.contains(&statistic).then(|| Tensor::<2>::from_data(TensorData::new(gradients.clone(), [count, 2]), device));
-    Ok(ViewStatistics {
-        radii: Tensor::<1, Int>::from_data(TensorData::new(vec![5i64; count], [count]), device),
-        screen_gradient: gradient(Statistic::ScreenGradient),
-        absolute_screen_gradient: gradient(Statistic::AbsoluteScreenGradient),
-        max_weights: wanted.contains(&Statistic::MaxWeight).then(|| Tensor::from_data(TensorData::new(weights, [count]), device)),
-        size: (640, 360),
-        views: 1,
-    })
+    Ok(statistics(vec![5; count], gradient, wanted.contains(&Statistic::MaxWeight).then_some(weights), device))
 }
 
 /// Drives a control through coarse and main stage. Training views recover from a removal in a fiftieth of the run, at least 60 and at most 400 iterations.

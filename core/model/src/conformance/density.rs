@@ -2,8 +2,8 @@
 
 use super::{guarded, settings_are_read, uniform};
 use crate::{
-    DensityControl, DensityPlan, DensityPlugin, Error, ExtraAttribute, Gaussians, HostGaussians, Result, Schedule, Seed, Stage, Statistic, ViewStatistics,
-    config,
+    Camera, DensityControl, DensityPlan, DensityPlugin, Error, ExtraAttribute, Gaussians, HostGaussians, Result, Schedule, Seed, Split, Stage, Statistic, View,
+    ViewStatistics, config,
 };
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
@@ -13,10 +13,13 @@ const COUNT: usize = 40;
 const MOST: usize = 20 * COUNT;
 /// Iterations of the suite's stages.
 const ITERATIONS: usize = 320;
+/// Frames of the suite's views.
+const FRAMES: usize = 20;
 /// Name of the extra attribute that identifies the Gaussians.
 const LABEL: &str = "conformance-label";
 
-/// Tests a density control on `device`, with a coarse and a main stage of random statistics. Each finding is a line; an empty list means that it passed.
+/// Tests a density control on `device`, with a coarse and a main stage of random statistics: two views per iteration, at the times of 20 frames.
+/// Each finding is a line; an empty list means that it passed.
 ///
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - Plans refer to existing rows and attributes, set finite values, and never remove all Gaussians; half of what they remove is kept, as the trainer may.
@@ -74,8 +77,8 @@ impl Suite<'_> {
     fn schedule(stage: Stage, iteration: usize) -> Schedule {
         Schedule { stage, iteration, total: 2 * ITERATIONS, ..Schedule::main(ITERATIONS) }
     }
-    /// Random statistics of a view of `count` Gaussians; `wanted` lists the optional ones.
-    fn view(&self, count: usize, wanted: &[Statistic], seed: Seed) -> ViewStatistics {
+    /// Random statistics of a camera's view of `count` Gaussians at `frame`; `wanted` lists the optional ones.
+    fn view(&self, count: usize, wanted: &[Statistic], camera: usize, frame: usize, seed: Seed) -> ViewStatistics {
         let draw = |k: usize| uniform(seed, k);
         let radii: Vec<i64> = (0..count).map(|i| if draw(i) > -0.6 { 1 + (4.0 * (draw(i) + 1.0)) as i64 } else { 0 }).collect();
         let pair = |shift: usize, absolute: bool| {
@@ -85,21 +88,22 @@ impl Suite<'_> {
             Tensor::<2>::from_data(TensorData::new(values, [count, 2]), self.device)
         };
         let weights: Vec<f32> = (0..count).map(|i| 0.5 + 0.5 * draw(7 * count + i)).collect();
-        ViewStatistics {
-            radii: Tensor::<1, Int>::from_data(TensorData::new(radii, [count]), self.device),
-            screen_gradient: wanted.contains(&Statistic::ScreenGradient).then(|| pair(2 * count, false)),
-            absolute_screen_gradient: wanted.contains(&Statistic::AbsoluteScreenGradient).then(|| pair(4 * count, true)),
-            max_weights: wanted.contains(&Statistic::MaxWeight).then(|| Tensor::from_data(TensorData::new(weights, [count]), self.device)),
-            size: (640, 360),
-            views: 2,
-        }
+        let eye = [[4.0, 0.0, 1.0], [0.0, 4.0, 1.0]][camera];
+        let view = View { camera, frame, time_norm: frame as f32 / (FRAMES - 1) as f32, split: Split::Train };
+        let camera = Camera::look_at(&format!("conformance-{camera}"), (640, 360), 1.0, eye, [0.0; 3], [0.0, 0.0, 1.0]);
+        let mut seen = ViewStatistics::new(camera, view, Tensor::<1, Int>::from_data(TensorData::new(radii, [count]), self.device));
+        seen.screen_gradient = wanted.contains(&Statistic::ScreenGradient).then(|| pair(2 * count, false));
+        seen.absolute_screen_gradient = wanted.contains(&Statistic::AbsoluteScreenGradient).then(|| pair(4 * count, true));
+        seen.max_weights = wanted.contains(&Statistic::MaxWeight).then(|| Tensor::from_data(TensorData::new(weights, [count]), self.device));
+        seen.views = 2;
+        seen
     }
     /// One iteration: statistics, noise, plan. Returns the plan and the Gaussians after it.
     fn iterate(&self, control: &mut dyn DensityControl, gaussians: Gaussians, schedule: &Schedule) -> Result<(Option<DensityPlan>, Gaussians)> {
         let seed = Seed::root(43).child(schedule.stage.name()).index(schedule.iteration as u64);
         let wanted = control.statistics(schedule);
-        for view in 0..2 {
-            control.observe(&self.view(gaussians.len(), &wanted, seed.index(view)))?;
+        for camera in 0..2 {
+            control.observe(&self.view(gaussians.len(), &wanted, camera, schedule.iteration % FRAMES, seed.index(camera as u64)))?;
         }
         let mut gaussians = gaussians;
         for (name, values) in control.after_step(&gaussians, schedule, seed.child("noise"))? {

@@ -99,11 +99,9 @@ impl Context<'_> {
         self.guard_plan(&mut plan, state, &schedule)?;
         self.carry_out(&plan, state, &schedule)?;
         state.density.executed(&plan, &self.device)?;
-        // The box of what moves is that of all key frames.
+        // More moves now, in a larger box.
         if let Some(ModelDeformer { section, .. }) = state.deformer.take() {
-            let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
-            let field = self.job.registry.build_deformer(&section, &context, &self.device)?;
-            state.deformer = Some(ModelDeformer { field, section, context });
+            state.deformer = Some(self.new_deformer(state, section)?);
         }
         Ok(())
     }

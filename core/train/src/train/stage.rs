@@ -8,7 +8,7 @@ use super::{Context, TrainState};
 use crate::checkpoint;
 use crate::checks::Watch;
 use crate::config::CoarseFrames;
-use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage};
+use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage, start_deformer};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use std::collections::BTreeMap;
@@ -151,12 +151,20 @@ impl Context<'_> {
         if of_first.len() >= 2 { of_first } else { all }
     }
 
-    /// Builds the deformer over the box of what moves, once the scores are known.
+    /// The deformer of a `[deformer]` section, over the box of what moves and started from it.
+    pub(super) fn new_deformer(&self, state: &TrainState, section: toml::Table) -> Result<ModelDeformer> {
+        let first = state.moving_gaussians()?;
+        let context = state.field_context(&first, self.job.scene.frame_count, self.seed.child("field"));
+        let field = self.job.registry.build_deformer(&section, &context, &self.device)?;
+        let mut deformer = ModelDeformer { field, section, context };
+        let name = deformer.name().to_string();
+        start_deformer(&name, deformer.field.as_mut(), &first)?;
+        Ok(deformer)
+    }
+
+    /// Builds the deformer, once the scores are known.
     fn begin_main(&self, state: &mut TrainState) -> Result<()> {
-        let section = &self.job.config.deformer;
-        let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
-        let field = self.job.registry.build_deformer(section, &context, &self.device)?;
-        let deformer = ModelDeformer { field, section: section.clone(), context };
+        let deformer = self.new_deformer(state, self.job.config.deformer.clone())?;
         state.set.add_attributes(&deformer.field.attributes(), self.seed.child("attributes"))?;
         let moves = !deformer.field.is_static() && state.moving_rows(&self.device)?.count() > 0;
         if !moves && !deformer.field.is_static() && state.moving != Moving::Nothing {

@@ -10,7 +10,7 @@ use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Scene, Seed, Similarity, SpatialInput, Split, Stage};
+use cc4dgs_core::{Appearance, DeformerContext, DensityControl, HostGaussians, Optimizer, Result, Scene, Seed, Similarity, SpatialInput, Split, Stage};
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Moving, MovingRows, RenderConfig};
 
@@ -137,17 +137,21 @@ impl TrainState {
         self.neighbours = None;
         self.rows = None;
     }
-    /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres, padded by 5 %.
-    pub fn field_context(&mut self, frame_count: usize, seed: Seed) -> Result<DeformerContext> {
+    /// The Gaussians that may move, or all if none may, without those that are not finite.
+    pub fn moving_gaussians(&self) -> Result<HostGaussians> {
         let host = self.set.host_gaussians()?;
         let mut rows = self.moving.rows(&host.dynamic_scores).unwrap_or_default();
         if rows.is_empty() {
             rows = (0..host.len()).collect();
         }
         rows.retain(|&row| host.is_finite(row));
+        Ok(host.select(&rows))
+    }
+    /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres of `first`, padded by 5 %.
+    pub fn field_context(&self, first: &HostGaussians, frame_count: usize, seed: Seed) -> DeformerContext {
         let (mut box_min, mut box_max) = ([0.0f32; 3], [0.0f32; 3]);
         for k in 0..3 {
-            let mut values: Vec<f32> = rows.iter().map(|&i| host.means[3 * i + k]).collect();
+            let mut values: Vec<f32> = first.means.iter().skip(k).step_by(3).copied().collect();
             values.sort_unstable_by(f32::total_cmp);
             let pick = |share: f64| values.get((values.len().saturating_sub(1) as f64 * share).round() as usize).copied().unwrap_or(0.0);
             let (low, high) = (pick(0.001), pick(0.999));
@@ -155,6 +159,6 @@ impl TrainState {
             let pad = (0.05 * (high - low)).max(1e-4 * (1.0 + low.abs().max(high.abs())));
             (box_min[k], box_max[k]) = (low - pad, high + pad);
         }
-        Ok(DeformerContext { box_min, box_max, frame_count, sh_degree: self.set.sh_degree, seed })
+        DeformerContext { box_min, box_max, frame_count, sh_degree: self.set.sh_degree, seed }
     }
 }

@@ -14,7 +14,7 @@ use burn::tensor::{Gradients, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     Camera, DeformerWork, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Scene, Schedule, SpatialInput, Splats, Stage, Statistic,
-    StepSettings, ViewStatistics,
+    StepSettings, View, ViewStatistics,
 };
 use cc4dgs_play::MovingRows;
 use cc4dgs_play::model::ModelDeformer;
@@ -42,6 +42,7 @@ struct Rendered<'a> {
     radii: Tensor<1, Int>,
     max_weights: Option<Tensor<1>>,
     camera: &'a Camera,
+    view: &'a View,
 }
 
 impl Context<'_> {
@@ -166,7 +167,8 @@ impl Context<'_> {
                 Some(other) => other.max_pair(radii.clone()),
                 None => radii.clone(),
             });
-            rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights: output.stats.max_weights, camera });
+            let (max_weights, view) = (output.stats.max_weights, &scene.views[view]);
+            rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera, view });
         }
         let Some(mut loss) = total else { return Ok(Outcome::Stepped) };
         if let (Some(deformer), Some(&view), Some(spatial)) = (&state.deformer, batch.first(), &spatial) {
@@ -203,12 +205,13 @@ impl Context<'_> {
             let moving = rows.count() as u64;
             log.count_deformer(work.vertices_decoded, work.vertices_queried - work.vertices_decoded, moving, n as u64 - moving);
         }
-        for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera } in rendered {
+        for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera, view } in rendered {
             let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
-            let (screen_gradient, absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));
-            let size = (camera.width, camera.height);
             state.guard.saw(&radii);
-            state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient, max_weights, size, views: batch.len() })?;
+            let mut of_view = ViewStatistics::new(camera.clone(), view.clone(), radii);
+            (of_view.screen_gradient, of_view.absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));
+            (of_view.max_weights, of_view.views) = (max_weights, batch.len());
+            state.density.observe(&of_view)?;
         }
         let of_gaussians = leaves.gradients(&gradients);
         if check && let Some(trouble) = broken_gradient(state, &of_gaussians, &gradients)? {

@@ -108,8 +108,9 @@ fn standard_normal(rng: &mut impl Rng) -> f32 {
 mod tests {
     use super::super::build;
     use super::*;
-    use burn::tensor::{Device, Int, Tensor, TensorData};
-    use cc4dgs_core::{ExtraAttribute, Gaussians, Schedule, Statistic, ViewStatistics};
+    use crate::density::seen;
+    use burn::tensor::{Device, Tensor};
+    use cc4dgs_core::{ExtraAttribute, Gaussians, Schedule, Statistic};
 
     fn host_of(n: usize) -> HostGaussians {
         HostGaussians {
@@ -201,14 +202,9 @@ mod tests {
             let gradient = |wanted: Statistic, value: f32| {
                 control.statistics(&schedule).contains(&wanted).then(|| Tensor::<2>::from_floats([[value, 0.0], [0.0, 0.0]], &device))
             };
-            let view = ViewStatistics {
-                radii: Tensor::<1, Int>::from_data(TensorData::new(vec![3i64, 3], [2]), &device),
-                screen_gradient: gradient(Statistic::ScreenGradient, 0.0),
-                absolute_screen_gradient: gradient(Statistic::AbsoluteScreenGradient, 1.0),
-                max_weights: None,
-                size: (8, 8),
-                views: 1,
-            };
+            let mut view = seen(&[3, 3], &device);
+            view.screen_gradient = gradient(Statistic::ScreenGradient, 0.0);
+            view.absolute_screen_gradient = gradient(Statistic::AbsoluteScreenGradient, 1.0);
             control.observe(&view).unwrap();
             control.plan(&Gaussians::from_host(&host, &device), &schedule, Seed::root(1)).unwrap().map_or(0, |plan| plan.report.cloned)
         };

@@ -271,6 +271,7 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::density::seen;
     use cc4dgs_core::HostGaussians;
 
     #[test]
@@ -333,14 +334,8 @@ mod tests {
         let device = Device::flex();
         let mut control = build(&toml::Table::new()).unwrap();
         control.begin_stage(2, &device);
-        let view = ViewStatistics {
-            radii: Tensor::<1, Int>::from_data(TensorData::new(vec![3i64, 3], [2]), &device),
-            screen_gradient: None,
-            absolute_screen_gradient: None,
-            max_weights: Some(Tensor::from_floats([0.5, 0.1], &device)),
-            size: (8, 8),
-            views: 1,
-        };
+        let mut view = seen(&[3, 3], &device);
+        view.max_weights = Some(Tensor::from_floats([0.5, 0.1], &device));
         control.observe(&view).unwrap();
         let sum = |name: &str| control.state().into_iter().find(|(n, _)| n == name).unwrap().1.sum().into_scalar::<f32>();
         assert!(sum("weights") > 0.0);

@@ -53,19 +53,16 @@ impl Weights {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use burn::tensor::Int;
+    use crate::density::seen;
 
     #[test]
     fn who_is_hidden_is_judged_after_some_rounds() {
         let device = Device::flex();
         let mut weights = Weights::zeros(4, &device);
-        let view = |largest: &[f32], radii: &[i64]| ViewStatistics {
-            radii: Tensor::<1, Int>::from_data(TensorData::new(radii.to_vec(), [radii.len()]), &device),
-            screen_gradient: None,
-            absolute_screen_gradient: None,
-            max_weights: Some(Tensor::from_floats(largest, &device)),
-            size: (8, 8),
-            views: 1,
+        let view = |largest: &[f32], radii: &[i64]| {
+            let mut view = seen(radii, &device);
+            view.max_weights = Some(Tensor::from_floats(largest, &device));
+            view
         };
         weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0])).unwrap();
         assert!(weights.smallest(9).unwrap().is_empty(), "all are new");

@@ -23,7 +23,7 @@ fn findings(suite: impl Fn(&Device) -> Vec<String>) -> String {
 #[test]
 fn the_deformers_conform() {
     let registry = Registry::collect().unwrap();
-    for name in ["sway", "wobble"] {
+    for name in ["control-points", "sway", "wobble"] {
         assert_eq!(findings(|device| conformance::deformer(registry.deformer(name).unwrap(), &Table::new(), device)), "");
     }
 }

@@ -2,9 +2,12 @@
 
 mod gradients;
 
-use super::{guarded, matrix, uniform, within};
+use super::{guarded, uniform, within};
 use crate::gaussians::to_vec;
-use crate::{Deformer, DeformerContext, DeformerPlugin, Error, Offsets, Result, Seed, SpatialInput, check_attributes, check_parameters, config};
+use crate::{
+    Deformer, DeformerContext, DeformerPlugin, Error, HostGaussians, Offsets, Result, Seed, SpatialInput, check_attributes, check_parameters, config,
+    start_deformer,
+};
 use burn::tensor::{Device, Tensor, TensorData};
 
 /// Largest difference of offsets from packed features or at several times at once, as a share of the largest offset: sums may run in another order.
@@ -24,6 +27,7 @@ const CENTRES: usize = 48;
 /// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer; a regularizer has a
 ///   gradient for every array that it depends on;
 /// - several times at once give the offsets of each; packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
+/// - `start_from` changes nothing but values of weights, whatever the number of Gaussians, and stored models are opened without it;
 /// - what `simplified` returns can be built again from its settings, and moves Gaussians in nearly the same way;
 /// - no centres, one centre and centres that are not finite give offsets or errors; missing attributes and times that are not numbers are refused.
 ///
@@ -63,8 +67,27 @@ impl Suite<'_> {
     fn context(&self) -> DeformerContext {
         DeformerContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: 20, sh_degree: 2, seed: Seed::root(11).child("conformance") }
     }
-    fn fresh(&self, device: &Device) -> Result<Built> {
+    /// A deformer as a stored model has it before its weights are replaced.
+    fn opened(&self, device: &Device) -> Result<Built> {
         (self.plugin.build)(self.settings, &self.context(), device)
+    }
+    /// A deformer as a training begins with it, from `count` Gaussians.
+    fn started(&self, count: usize, device: &Device) -> Result<Built> {
+        let mut built = self.opened(device)?;
+        start_deformer(self.plugin.info.name, built.as_mut(), &self.first(count))?;
+        Ok(built)
+    }
+    fn fresh(&self, device: &Device) -> Result<Built> {
+        self.started(CENTRES, device)
+    }
+    /// The first Gaussians of a training.
+    fn first(&self, count: usize) -> HostGaussians {
+        let mut first = HostGaussians { sh_degree: self.context().sh_degree, ..Default::default() };
+        for (index, (_, width, values)) in first.columns_mut().into_iter().enumerate() {
+            *values = (0..count * width).map(|k| uniform(Seed::root(19).index(index as u64), k)).collect();
+        }
+        first.means = Self::centre_values(count);
+        first
     }
     /// A deformer with random changes of all weights.
     fn shaken(&self, device: &Device) -> Result<Built> {
@@ -78,11 +101,13 @@ impl Suite<'_> {
         }
         Ok(built)
     }
-    /// Centres inside the box and a few outside.
+    /// Centres inside the box and a few outside, row-major.
+    fn centre_values(n: usize) -> Vec<f32> {
+        let (scale, shift) = ([1.1, 0.55, 1.1], [0.0, 0.0, 1.0]);
+        (0..3 * n).map(|k| uniform(Seed::root(3), k) * scale[k % 3] + shift[k % 3]).collect()
+    }
     fn centres(&self, n: usize, device: &Device) -> Tensor<2> {
-        let scale = Tensor::<2>::from_data(TensorData::new(vec![1.1f32, 0.55, 1.1], [1, 3]), device);
-        let shift = Tensor::<2>::from_data(TensorData::new(vec![0.0f32, 0.0, 1.0], [1, 3]), device);
-        matrix(Seed::root(3), n, 3, device) * scale + shift
+        Tensor::from_data(TensorData::new(Self::centre_values(n), [n, 3]), device)
     }
     /// Random values of the attributes of `n` Gaussians, row-major.
     fn attribute_values(&self, built: &dyn Deformer, n: usize) -> Vec<Vec<f32>> {
@@ -248,7 +273,7 @@ impl Suite<'_> {
         Ok(None)
     }
     fn weights_carry_everything(&self) -> Result<Option<String>> {
-        let (built, mut copy) = (self.shaken(self.device)?, self.fresh(self.device)?);
+        let (built, mut copy) = (self.shaken(self.device)?, self.opened(self.device)?);
         for (to, from) in copy.parameters_mut().into_iter().zip(built.parameters()) {
             if to.name != from.name || to.shape != from.shape {
                 return Ok(Some(format!("a new deformer has {} {:?}, this one has {} {:?}", to.name, to.shape, from.name, from.shape)));
@@ -264,6 +289,10 @@ impl Suite<'_> {
         let built = self.shaken(self.device)?;
         for n in [0, 1] {
             self.offsets(built.as_ref(), &self.input(built.as_ref(), n, self.device), 0.5)?;
+            let few = self.started(n, self.device)?;
+            if !self.values(few.as_ref(), CENTRES, 0.5, self.device)?.iter().all(|v| v.is_finite()) {
+                return Ok(Some(format!("offsets are not finite where start_from had {n} Gaussians")));
+            }
         }
         if built.is_static() {
             return Ok(None);
