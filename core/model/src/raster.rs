@@ -156,7 +156,8 @@ pub struct RenderWork {
 /// Renders Gaussians, differentiably.
 pub trait Rasterizer: Send + Sync {
     /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients, the probes included,
-    /// receives one in the backward pass. A probe must not change the planes or other gradients.
+    /// receives one in the backward pass. A probe must not change the planes or other gradients. Several views may be drawn at a time by
+    /// rayon's threads: hold no lock while a parallel loop runs.
     ///
     /// # Errors
     /// [`Error::Parameter`] for shapes and settings that do not fit, [`Error::Limit`] for sizes that the device cannot hold, [`Error::Unsupported`] for a device

@@ -96,3 +96,14 @@ fn a_scene_without_depth_is_refused() {
     assert!(message.starts_with("loss depth: ") && message.contains("depth_file_path"), "{message}");
     assert_eq!(train(0.0), Ok(()), "a term without weight wants nothing");
 }
+
+#[test]
+fn scores_are_not_trained_on_depth() {
+    let session = Session::builder().device("flex").build().unwrap();
+    let mut sets = sets(0.0, 4);
+    sets.push("score_loss={kind='depth', weight=1.0}".into());
+    let config = session.config("demo", &sets.iter().map(String::as_str).collect::<Vec<_>>()).unwrap();
+    let scene = session.read_scene("procedural:captures/sparse", &config.scene).unwrap();
+    let message = session.train(&config, scene, None).map(drop).unwrap_err().to_string();
+    assert!(message.starts_with("score_loss depth: ") && message.contains("mask-bce"), "{message}");
+}

@@ -76,7 +76,7 @@ pub struct SceneOptions {
     /// Background the images are composited over and the renders start from; the dataset's own if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<Background>,
-    /// Memory for decoded frames, in megabytes (10^6 bytes).
+    /// Memory for decoded frames and recorded depth, in megabytes (10^6 bytes).
     pub cache_mb: u64,
     /// Cameras to hold out, instead of the dataset's own split.
     #[serde(skip_serializing_if = "Option::is_none")]

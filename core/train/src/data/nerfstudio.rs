@@ -111,7 +111,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let [train, test, validation] = [&transforms.train_filenames, &transforms.test_filenames, &transforms.val_filenames].map(|names| named(names));
     let named_split = [&train, &test, &validation].iter().any(|names| !names.is_empty());
     let unit = transforms.depth_unit_scale_factor.unwrap_or(DEPTH_UNIT);
-    let (mut missing, mut missing_depth, mut unlisted, mut seen) = (Vec::new(), 0, 0, 0);
+    let (mut missing, mut missing_depth, mut depth_of_videos, mut unlisted, mut seen) = (Vec::new(), 0, 0, 0, 0);
     let mut times = Vec::new();
     let of_frame = |frame: &Frame, image_size: &dyn Fn() -> Result<(u32, u32)>, bad: &dyn Fn(String) -> Error| {
         camera(&frame.file_path, &frame.transform_matrix, &frame.own.over(&transforms.shared), image_size, bad)
@@ -145,6 +145,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             let images = footage.images.into_iter().enumerate().filter_map(|(index, image)| image.map(|image| (index, image)));
             scene.views.extend(images.map(|(index, image)| RawView { camera: scene.cameras.len(), frame: index, time: None, split, image }));
             scene.cameras.push(camera);
+            depth_of_videos += usize::from(frame.depth_file_path.is_some());
             continue;
         }
         scene.cameras.push(of_frame(frame, &|| image_size(&path, limits), &bad)?);
@@ -153,6 +154,9 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         missing_depth += usize::from(frame.depth_file_path.is_some() && depth.is_none());
         let image = ImageSource::File { path, mask: None, depth };
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image });
+    }
+    if depth_of_videos > 0 {
+        scene.warnings.push(format!("{depth_of_videos} videos have a depth_file_path, which is read for images alone; their depth is unknown"));
     }
     if missing_depth > 0 {
         scene.warnings.push(format!("{missing_depth} images have a depth_file_path that names no file; their depth is unknown"));

@@ -60,6 +60,12 @@ impl LossTerms {
             "Name the 16-bit PNG files of depth as depth_file_path in transforms.json, or remove the term",
         ))
     }
+    /// Refuses terms that compare recorded depth, of which the score stage has none.
+    pub fn refuse_depth(&self) -> Result<()> {
+        let Some(Term { name, .. }) = self.0.iter().find(|term| term.term.wants_depth()) else { return Ok(()) };
+        let problem = "it compares recorded depth, which the score stage does not read";
+        Err(Error::parameter(format!("score_loss {name}"), problem, "Choose another kind, such as mask-bce, and list the term under loss"))
+    }
     /// The weighted sum `[1]` for one view.
     pub fn value(&self, input: &LossInput) -> Result<Tensor<1>> {
         let mut total: Option<Tensor<1>> = None;

@@ -216,6 +216,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let losses = LossTerms::build(job.registry, &config.loss)?;
     losses.check_depth(&job.scene)?;
     let score_loss = LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?;
+    score_loss.refuse_depth()?;
     let mut state = match start {
         Start::Resumed(state) => *state,
         Start::New(parts) => {
