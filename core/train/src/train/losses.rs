@@ -46,11 +46,15 @@ impl LossTerms {
     }
     /// Whether a term compares recorded depth.
     pub fn want_depth(&self) -> bool {
-        self.0.iter().any(|term| term.term.wants_depth())
+        self.of_depth().is_some()
+    }
+    /// The first term that compares recorded depth.
+    fn of_depth(&self) -> Option<&Term> {
+        self.0.iter().find(|term| term.term.wants_depth())
     }
     /// Refuses terms that compare recorded depth where no training view of `scene` has it.
     pub fn check_depth(&self, scene: &Scene) -> Result<()> {
-        let Some(Term { name, .. }) = self.0.iter().find(|term| term.term.wants_depth()) else { return Ok(()) };
+        let Some(Term { name, .. }) = self.of_depth() else { return Ok(()) };
         if scene.has_depth()? {
             return Ok(());
         }
@@ -62,7 +66,7 @@ impl LossTerms {
     }
     /// Refuses terms that compare recorded depth, of which the score stage has none.
     pub fn refuse_depth(&self) -> Result<()> {
-        let Some(Term { name, .. }) = self.0.iter().find(|term| term.term.wants_depth()) else { return Ok(()) };
+        let Some(Term { name, .. }) = self.of_depth() else { return Ok(()) };
         let problem = "it compares recorded depth, which the score stage does not read";
         Err(Error::parameter(format!("score_loss {name}"), problem, "Choose another kind, such as mask-bce, and list the term under loss"))
     }
