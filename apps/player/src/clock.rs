@@ -52,10 +52,13 @@ impl Clock {
     pub fn seek(&mut self, time_norm: f32) {
         self.time = if time_norm.is_nan() { 0.0 } else { time_norm.clamp(0.0, 1.0) };
     }
-    /// Goes to the nearest frame and `frames` on, and stops.
+    /// Goes to the nearest frame and `frames` on, and stops. Where there is one frame only, time stays.
     pub fn step(&mut self, frames: i32) {
         self.playing = false;
-        let last = self.frames.saturating_sub(1).max(1) as f32;
+        if self.frames < 2 {
+            return;
+        }
+        let last = (self.frames - 1) as f32;
         self.seek(((self.time * last).round() + frames as f32) / last);
     }
     /// Index of the nearest frame.
@@ -89,5 +92,8 @@ mod tests {
         assert_eq!(clock.time, 0.0);
         clock.seek(f32::NAN);
         assert_eq!(clock.time, 0.0);
+        let mut still = Clock::new(1, 2.0);
+        still.step(1);
+        assert_eq!((still.time, still.frame()), (0.0, 0), "a single frame has no next one");
     }
 }

@@ -23,7 +23,7 @@ pub mod window;
 
 pub use clock::Clock;
 pub use content::Content;
-pub use navigator::Navigator;
+pub use navigator::{Navigator, Pose};
 pub use render::{Mode, Renderer, View, device_of, request_device};
 pub use scene::Scene;
 

@@ -15,8 +15,14 @@ const POLE: f64 = 0.03;
 const NEAREST: f64 = 1e-6;
 /// Full vertical angles that a pose may have, in radians: from telescopes to nearly half of all directions.
 pub(crate) const POSE_FOV: RangeInclusive<f64> = 1e-9..=3.1;
+/// Widths over heights that a pose may have: those of all images.
+pub(crate) const POSE_ASPECT: RangeInclusive<f64> = 1e-10..=1e10;
 /// Below this angle in radians a link writes more decimals of eye and target: a millionth of their distance would be seen.
 const NARROW: f64 = 0.01;
+
+/// Eye, target, full vertical angle, roll and aspect (width over height); angles in radians. An image of any shape shows at least what one of this aspect does.
+/// The aspect 0 stands for that of the first view.
+pub type Pose = [f64; 9];
 
 /// A free camera with a point that it orbits.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,7 +35,7 @@ pub struct Navigator {
     pub up: DVec3,
     /// Full vertical angle in radians, of images at least as wide as `aspect` says; narrower ones show as much to the sides, and more above and below.
     pub fov_y: f64,
-    /// Width over height of the camera that was taken last.
+    /// Width over height of the camera or the pose that was taken last.
     aspect: f64,
     /// Rotation of the camera around its viewing direction that captured cameras may have, in radians; 0 after the user orbits.
     roll: f64,
@@ -154,32 +160,45 @@ impl Navigator {
             world_to_camera: [row(right), row(down), row(self.forward()), [0.0, 0.0, 0.0, 1.0]],
         }
     }
-    /// Eye, target, vertical angle and roll, angles in radians, for links.
-    pub fn pose(&self) -> [f64; 8] {
+    /// The pose that leads back to exactly this view, in images of all shapes.
+    pub fn pose(&self) -> Pose {
         let (e, t) = (self.eye, self.target);
-        [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y, self.roll]
+        [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y, self.roll, self.aspect]
     }
-    /// The pose of seven or eight numbers, `None` for another number of them. Without the eighth there is no roll.
-    pub fn pose_of(numbers: &[f64]) -> Option<[f64; 8]> {
-        (7..=8).contains(&numbers.len()).then(|| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(0.0)))
+    /// The pose of all that an image of this size in pixels shows, for links: images of other shapes show at least as much to the sides, above and below. Of
+    /// angles over 3.1 it has 3.1.
+    pub fn pose_shown(&self, width: u32, height: u32) -> Pose {
+        let camera = self.camera(width, height);
+        let most = (0.5 * POSE_FOV.end()).tan();
+        let half = |side: u32, focal: f64| (0.5 * f64::from(side) / focal).min(most);
+        let (across, down) = (half(camera.width, camera.fx), half(camera.height, camera.fy));
+        let mut pose = self.pose();
+        (pose[6], pose[8]) = ((2.0 * down.atan()).clamp(*POSE_FOV.start(), *POSE_FOV.end()), across / down);
+        pose
     }
-    /// `pose` as links and commands have it: numbers with commas between, eight where there is a roll, else seven. Positions are right to a millionth of the
+    /// The pose of seven to nine numbers, `None` for another number of them. Without the eighth there is no roll; without the ninth, as in older links, the aspect
+    /// is that of the first view.
+    pub fn pose_of(numbers: &[f64]) -> Option<Pose> {
+        (7..=9).contains(&numbers.len()).then(|| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(0.0)))
+    }
+    /// `pose` as links and commands have it: numbers with commas between, without zeros for roll and aspect at the end. Positions are right to a millionth of the
     /// distance between eye and target, however far from the origin they are, or of views narrower than 0.01 to a ten-thousandth of what is seen at the target.
-    pub fn pose_text(pose: [f64; 8]) -> String {
+    pub fn pose_text(pose: Pose) -> String {
         let distance = (0..3).map(|axis| (pose[axis] - pose[axis + 3]).powi(2)).sum::<f64>().sqrt();
         let decimals = |size: f64, least: f64| (6.0 - size.log10().floor()).clamp(least, 17.0) as usize;
         let (positions, angle) = (decimals(distance * (pose[6] / NARROW).min(1.0), 0.0), decimals(pose[6], 7.0));
-        let places = [positions, positions, positions, positions, positions, positions, angle, 7];
+        let places = [positions, positions, positions, positions, positions, positions, angle, 7, decimals(pose[8], 0.0)];
         let text: Vec<String> = pose.iter().zip(places).map(|(&v, places)| rounded(v, places)).collect();
-        let shown = if text[7] == "0" { 7 } else { 8 };
+        let shown = 7 + text[7..].iter().rposition(|number| number != "0").map_or(0, |last| last + 1);
         text[..shown].join(",")
     }
     /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored. Returns whether it was taken.
-    pub fn set_pose(&mut self, pose: [f64; 8]) -> bool {
+    pub fn set_pose(&mut self, pose: Pose) -> bool {
         let (eye, target) = (DVec3::new(pose[0], pose[1], pose[2]), DVec3::new(pose[3], pose[4], pose[5]));
-        let sees = pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && POSE_FOV.contains(&pose[6]);
+        let aspect = if pose[8] == 0.0 { self.first.3 } else { pose[8] };
+        let sees = pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && POSE_FOV.contains(&pose[6]) && POSE_ASPECT.contains(&aspect);
         if sees {
-            (self.eye, self.target, self.fov_y, self.roll) = (eye, target, pose[6], pose[7]);
+            (self.eye, self.target, self.fov_y, self.roll, self.aspect) = (eye, target, pose[6], pose[7], aspect);
         }
         sees
     }
@@ -299,9 +318,10 @@ mod tests {
             assert!(Navigator::new(&Presentation::default(), [-1.0; 3], [1.0; 3]).set_pose(read), "{text}");
             assert_eq!(Navigator::pose_text(read), text, "a link of a link is another");
         }
-        assert_eq!(Navigator::pose_text([1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, -1e-7, 0.927_295_218, 1e-9]), "1,-2.5,0.333333,0,0,0,0.9272952");
-        assert_eq!(Navigator::pose_text([1000.0, 0.0, 2e7, -300.0, -0.4, 0.0, 0.9, -0.25]), "1000,0,20000000,-300,0,0,0.9,-0.25");
-        assert!(Navigator::pose_of(&[1.0; 6]).is_none() && Navigator::pose_of(&[1.0; 9]).is_none());
+        assert_eq!(Navigator::pose_text([1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, -1e-7, 0.927_295_218, 1e-9, 0.0]), "1,-2.5,0.333333,0,0,0,0.9272952");
+        assert_eq!(Navigator::pose_text([1000.0, 0.0, 2e7, -300.0, -0.4, 0.0, 0.9, -0.25, 0.0]), "1000,0,20000000,-300,0,0,0.9,-0.25");
+        assert_eq!(Navigator::pose_text([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0, 16.0 / 9.0]), "1,0,0,0,0,0,0.9,0,1.777778");
+        assert!(Navigator::pose_of(&[1.0; 6]).is_none() && Navigator::pose_of(&[1.0; 10]).is_none());
         // A captured camera that was held at an angle stays so.
         let rolled = Camera::look_at("rolled", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.3, 0.1, 1.0]);
         let shown = Presentation { home: Some(rolled), up: Some([0.0, 0.0, 1.0]), ..Default::default() };
@@ -312,6 +332,41 @@ mod tests {
         let (wanted, found) = (start.camera(640, 480).world_to_camera, linked.camera(640, 480).world_to_camera);
         let far = wanted.iter().flatten().zip(found.iter().flatten()).fold(0.0f64, |worst, (a, b)| worst.max((a - b).abs()));
         assert!(far < 1e-4, "the link turns the view by {far}");
+    }
+
+    #[test]
+    fn links_show_all_that_the_sender_saw_in_windows_of_any_shape() {
+        let shown = Presentation { home: Some(home()), up: Some([0.0, 0.0, 1.0]), target: Some([0.2, 0.1, 0.3]), ..Default::default() };
+        let start = Navigator::new(&shown, [-1.0; 3], [1.0; 3]);
+        // Half of what an image shows at distance 1, across and down.
+        let half = |navigator: &Navigator, (width, height): (u32, u32)| {
+            let camera = navigator.camera(width, height);
+            [0.5 * f64::from(width) / camera.fx, 0.5 * f64::from(height) / camera.fy]
+        };
+        let shapes = [(1920, 1080), (390, 844), (640, 480), (2560, 400), (300, 16_000)];
+        for sender in shapes {
+            let sent = half(&start, sender);
+            let text = Navigator::pose_text(start.pose_shown(sender.0, sender.1));
+            let numbers: Vec<f64> = text.split(',').map(|v| v.parse().unwrap()).collect();
+            for window in shapes {
+                let mut linked = start.clone();
+                linked.orbit(0.3, 0.2);
+                assert!(linked.set_pose(Navigator::pose_of(&numbers).unwrap()), "{text}");
+                let seen = half(&linked, window);
+                let shares = [seen[0] / sent[0], seen[1] / sent[1]];
+                assert!((shares[0].min(shares[1]) - 1.0).abs() < 1e-5, "{window:?} shows {shares:?} of what {sender:?} showed: {text}");
+            }
+        }
+        // A window of one column of pixels shows more than a pose may have.
+        let mut linked = start.clone();
+        assert!(linked.set_pose(start.pose_shown(1, 16_000)), "{:?}", start.pose_shown(1, 16_000));
+        // A pose of another camera has its shape, and one of an older link that of the first view.
+        linked.go_to(&Camera::look_at("tall", (100, 400), 0.3, [1.0, 5.0, 2.0], [0.0; 3], [0.3, 0.1, 1.0]));
+        let (tall, pose) = (linked.clone(), linked.pose());
+        assert!(linked.set_pose(Navigator::pose_of(&start.pose()[..8]).unwrap()));
+        assert_eq!(linked, start);
+        assert!(linked.set_pose(pose));
+        assert_eq!(linked, tall);
     }
 
     #[test]
@@ -344,7 +399,8 @@ mod tests {
             navigator.camera(10, 10).validate().unwrap();
         }
         let pose = navigator.pose();
-        assert!(!navigator.set_pose([f64::NAN; 8]));
+        assert!(!navigator.set_pose([f64::NAN; 9]));
+        assert!(!navigator.set_pose(std::array::from_fn(|k| if k == 8 { -1.0 } else { pose[k] })));
         assert_eq!(navigator.pose(), pose);
         assert!(navigator.set_pose(pose));
         navigator.zoom(f64::NAN);

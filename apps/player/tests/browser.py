@@ -9,7 +9,8 @@ import argparse, pathlib, time
 from browser_destroy import destroyed
 from browser_faults import broken_module, fetched_meanwhile, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
 from browser_gaussian import one_gaussian, remarks
-from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, reduced_motion, reloaded, touch, wheel
+from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, low, reduced_motion, touch, wheel
+from browser_keep import frames, reloaded, several, shapes
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
 from playwright.sync_api import sync_playwright
@@ -86,6 +87,7 @@ def main():
         held(page)
         cameras(page)
         key_list(page)
+        shapes(pages, page)
         webgl(pages, facts)
         lost(pages, page, facts)
         arriving(pages, page, facts, len(archive), args.layers)
@@ -111,8 +113,11 @@ def main():
         phone(pages, args.archive)
         embedded(pages)
         focus(pages)
+        low(pages)
         reduced_motion(pages)
         reloaded(pages)
+        frames(pages)
+        several(pages)
         for file, name in ((args.single, "single"), (args.weights, "weights")):
             if file:
                 from_disk(pages, pathlib.Path(file).resolve(), name, facts)
@@ -175,7 +180,8 @@ def navigation(pages, page):
     page.keyboard.press("r")
     assert apart(pose, page.evaluate(POSE)) < 1e-6
     other = pages.open("?" + link.split("?", 1)[1])
-    assert apart(moved, other.evaluate(POSE)) < 1e-3
+    # Angle and aspect of a link are those of the window; `shapes` checks them.
+    assert apart(moved[:6], other.evaluate(POSE)[:6]) < 1e-3
     assert abs(other.evaluate("cc4dgs.time") - page.evaluate("cc4dgs.time")) < 1e-4
     followed(other, pose)
     other.close()
@@ -361,6 +367,9 @@ def from_disk(pages, path, name, facts):
             page.wait_for_function("cc4dgs.gl.settled && !cc4dgs.dirty")
             assert page.evaluate("!!cc4dgs.gl.sorter.worker"), "the worker does not start in a file"
         pages.shot(page, name + ("_webgl" if backend else ""))
+        page.reload()
+        page.wait_for_function("window.cc4dgs?.facts")
+        assert abs(page.evaluate("cc4dgs.time") - 0.5) < 1e-6 and not page.evaluate("cc4dgs.playing"), "a file that is loaded again does not go on as it was"
         page.close()
     context.close()
     pages.quiet(f"the file {path.name}")

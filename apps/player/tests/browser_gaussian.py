@@ -29,6 +29,10 @@ def one_gaussian(pages):
         page.evaluate(OPEN, [0.05, 0.05, 0.05])
         brightest = page.evaluate(BRIGHTEST)
         assert brightest > 150, f"a single Gaussian is not seen: at most {brightest}"
+        for key in ("End", ".", " "):
+            page.keyboard.press(key)
+        still = page.evaluate("[cc4dgs.time, cc4dgs.playing, document.querySelector('.bar output').textContent]")
+        assert still == [0, False, "still"] and page.get_by_label("Play", exact=True).is_disabled(), f"keys move the time of a single frame: {still}"
         for step in range(24):
             # Its square is just below a power of two, and over it with that of the height: there sums are rounded most.
             width = 30 + 0.07 * step

@@ -1,4 +1,4 @@
-"""Checks of browser.py: files that are dropped, fingers on a screen, wheels, keys, reduced motion, and pages that are loaded again."""
+"""Checks of browser.py: files that are dropped, fingers on a screen, wheels, keys, low windows, and reduced motion."""
 import math
 from browser_pages import MODEL, PATIENCE_MS, say
 
@@ -115,25 +115,6 @@ def key_list(page):
     say("the question mark lists the keys")
 
 
-def reloaded(pages):
-    """A page that is loaded again has settings, time and pose of before, and plays no more than it did."""
-    page = pages.open(f"?src={MODEL}&autoplay")
-    page.evaluate("cc4dgs.pause(); cc4dgs.seek(0.375); cc4dgs.gpu.orbit(0.3, 0.1); cc4dgs.set('tint', true); cc4dgs.set('speed', 0.25)")
-    pose = page.evaluate(POSE)
-    page.reload()
-    page.wait_for_function("window.cc4dgs?.facts")
-    time, playing, tint, speed = page.evaluate("[cc4dgs.time, cc4dgs.playing, cc4dgs.settings.tint, document.querySelector('.bar select').value]")
-    far = max(abs(a - b) for a, b in zip(pose, page.evaluate(POSE)))
-    assert far < 1e-9 and abs(time - 0.375) < 1e-6 and not playing and tint and speed == "0.25", [far, time, playing, tint, speed]
-    address = page.url
-    page.goto("about:blank"), page.goto(address)
-    page.wait_for_function("window.cc4dgs?.facts")
-    assert not page.evaluate("cc4dgs.settings.tint"), "a page that is opened anew has the state of one before"
-    page.close()
-    pages.quiet("a page that is loaded again")
-    say("a page that is loaded again goes on as it was")
-
-
 def focus(pages):
     """The keyboard's focus on the view is seen."""
     page = pages.open()
@@ -207,6 +188,30 @@ def touch(page):
     assert abs(aligned - 1) < 1e-6, "a third finger turns the camera"
     page.evaluate("cc4dgs.reset()")
     say(f"one finger orbits ({turned:.2f} rad), two that part come nearer ({nearer:.2f} times)")
+
+
+def low(pages):
+    """In a low frame the settings open and close, all of a message can be read, and another file can be opened."""
+    page = pages.open(f"?src={MODEL}", size=(320, 180))
+    gear = page.get_by_label("Settings and help")
+    gear.click()
+    height = page.evaluate("document.querySelector('.panel').clientHeight")
+    assert height > 120, f"the settings are {height} pixels high"
+    # Escape closes them from a list, too.
+    page.locator(".panel select").first.focus()
+    page.keyboard.press("Escape")
+    assert page.locator(".panel").is_hidden(), "Escape does not close the settings from a list"
+    gear.click(), gear.click()
+    assert page.locator(".panel").is_hidden(), "the button does not close the settings"
+    page.close()
+    page = pages.open("?src=/text.cc4d", size=(320, 180))
+    fits, free = page.evaluate("""(() => { const box = document.querySelector(".note").getBoundingClientRect(), open = document.querySelector(".open"), at = open.getBoundingClientRect();
+        const above = document.elementFromPoint(at.x + at.width / 2, at.y + at.height / 2);
+        return [box.top >= 0 && box.bottom <= innerHeight && box.height > 40, open.contains(above)]; })()""")
+    assert fits and free, f"a message fits into the frame: {fits}, and leaves the button to open another file: {free}"
+    page.close()
+    pages.quiet("low windows")
+    say("in a frame of 320x180 the settings and messages can be used")
 
 
 def embedded(pages):

@@ -9,8 +9,12 @@ LEAST_DB = 40.0
 MODEL = "/model.cc4d"
 # A frame of a real scene takes seconds in software.
 PATIENCE_MS = 180000
-EMBEDDING = f"""<!doctype html><html lang="en"><title>embedding</title><link rel="icon" href="data:,"><body>
-<p>A page with a player in it.</p><iframe src="index.html?src={MODEL}&amp;autoplay" width="480" height="320" style="border: 0"></iframe></body></html>"""
+HEAD = '<!doctype html><html lang="en"><title>embedding</title><link rel="icon" href="data:,">'
+# Pages with a player in a frame of this site, of another site, and without storage; and with three players of their own.
+FRAME = HEAD + f'<body><p>A page with a player in it.</p><iframe %s src="%sindex.html?src={MODEL}&amp;autoplay" width="480" height="320" style="border: 0"></iframe></body></html>'
+SEVERAL = HEAD + f"""<link rel="stylesheet" href="player.css"><body><div></div><div></div><div></div><style>body > div {{ height: 180px }}</style><script type="module">import {{ createPlayer }} from "./player.js";
+const src = "{MODEL}", [one, two, three] = document.querySelectorAll("body > div");
+window.players = [await createPlayer(one, {{ src }}), await createPlayer(two, {{ src }}), await createPlayer(three, {{ src, remember: false }})];</script></body></html>"""
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
@@ -23,8 +27,10 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
     def do_GET(self):
         path = self.path.split("?")[0]
-        if path == "/embedding.html":
-            return self.answer(EMBEDDING.encode(), 200, {"Content-Type": "text/html; charset=utf-8"})
+        other_site = f"http://localhost:{self.server.server_port}/"
+        embedding = {"/embedding.html": FRAME % ("", ""), "/abroad.html": FRAME % ("", other_site), "/sandboxed.html": FRAME % ('sandbox="allow-scripts"', ""), "/several.html": SEVERAL}
+        if path in embedding:
+            return self.answer(embedding[path].encode(), 200, {"Content-Type": "text/html; charset=utf-8"})
         if not path.endswith(".cc4d"):
             return super().do_GET()
         body = self.archives.get(path)
@@ -34,7 +40,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         Handler.requests.append((path, wanted))
         pieces = 40 if "slow" in path else 1
         if "gzip" in path:
-            return self.answer(gzip.compress(body), 200, {"Content-Encoding": "gzip", "Access-Control-Allow-Origin": "*"})
+            return self.answer(gzip.compress(body), 200, {"Content-Encoding": "gzip"})
         version = {"ETag": '"1"'} if "tagged" in path else {}
         if "tagged" in path and wanted and not wanted.startswith("bytes=0-"):
             assert self.headers.get("If-Range") == '"1"', "parts are asked for without a condition"
@@ -48,6 +54,11 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             return self.answer(body, 416, {"Content-Range": "bytes */0"})
         part, place = self.part(wanted, body)
         self.answer(part, 206, {**version, "Content-Range": place}, pieces)
+
+    def end_headers(self):
+        # Frames without storage are of a site of their own.
+        self.send_header("Access-Control-Allow-Origin", "*")
+        super().end_headers()
 
     @staticmethod
     def part(wanted, body):

@@ -49,33 +49,68 @@ export function followLink(player) {
     player.dirty = true;
 }
 
-// Where the state of this page is kept: under its address without time and pose, and the model that it opens.
-const kept = ({ own }) => `cc4dgs ${location.pathname}${location.search} ${typeof own === "string" ? own : ""}`;
+// A frame cannot ask a page of another site whether it was loaded again. It restores what it kept less than so many milliseconds ago.
+const FRAME_MS = 30000;
 
-/// Has the page that `player` is alone follow links, and go on as it was after a reload. Until `signal` aborts.
+// This page and those that it is a frame of, the innermost first: when each `began`, in milliseconds, and whether it was loaded `again`. `crossSite` says that the list
+// ends before a page of another site, which does not tell.
+const around = [];
+let crossSite = false;
+try {
+    for (let page = window, inner = null; page !== inner; [page, inner] = [page.parent, page]) {
+        // Chromium says "navigate" in a frame of a page that was reloaded.
+        const type = page.performance.getEntriesByType("navigation")[0]?.type;
+        around.push({ began: page.performance.timeOrigin, again: ["reload", "back_forward"].includes(type) });
+    }
+} catch { crossSite = true; }
+
+// Names of the players in this page: several may show the same model.
+const names = new Set();
+
+/// Names `player` by the model that it opens, its number among the players of that model, and that of this frame in its page. Until the player is destroyed.
+function register({ own, life }) {
+    const frame = Array.prototype.indexOf.call(window.parent, window), source = typeof own === "string" ? own : "";
+    let name, number = 0;
+    do name = `${frame} ${number++} ${source}`; while (names.has(name));
+    names.add(name);
+    life.signal.addEventListener("abort", () => names.delete(name));
+    return name;
+}
+
+// Where the state of a player is kept: under the address of its page without time and pose, and its name.
+const kept = ({ keptAs }) => `cc4dgs ${location.pathname}${location.search} ${keptAs}`;
+
+/// Has `player` go on as it was after a reload, where it does, and follow links to the page that it is alone. Until `signal` aborts.
 export function remember(player, signal) {
     const keep = () => {
         const { settings, flying, gpu, drawnFacts, source, own } = player;
         // The model that was opened last is not the one that a reload opens, unless it is that of the page.
         const view = gpu && drawnFacts && source === own ? { ...player.now, pose: Array.from(gpu.pose) } : null;
-        // Some pages have no storage.
-        try { sessionStorage.setItem(kept(player), JSON.stringify({ settings, flying, view })); } catch (e) { console.debug(e); }
+        const state = { settings, flying, view, at: Date.now(), began: around.map(page => page.began) };
+        // Some pages have no storage, such as those in frames with `sandbox`.
+        try { sessionStorage.setItem(kept(player), JSON.stringify(state)); } catch (e) { console.debug(e); }
     };
-    window.addEventListener("pagehide", keep, { signal });
-    // Phones end pages that nobody sees without another word.
-    document.addEventListener("visibilitychange", () => { if (document.hidden) keep(); }, { signal });
+    if (player.keptAs) {
+        window.addEventListener("pagehide", keep, { signal });
+        // Phones end pages that nobody sees without another word.
+        document.addEventListener("visibilitychange", () => { if (document.hidden) keep(); }, { signal });
+    }
     // Where the page is open already, a link to it changes the hash alone. "Copy link" replaces the address, of which nobody is told.
-    window.addEventListener("hashchange", () => followLink(player), { signal });
+    if (!player.ui.embedded) window.addEventListener("hashchange", () => followLink(player), { signal });
 }
 
 /// Gives `player` the settings that it had before its page was loaded again, once; returns how its model stood then, null where that is not known.
 export function restore(player) {
-    const again = ["reload", "back_forward"].includes(performance.getEntriesByType("navigation")[0]?.type);
-    if (!again || player.ui.embedded) return null;
     try {
-        const { settings, flying, view } = JSON.parse(sessionStorage.getItem(kept(player))) ?? {};
+        player.keptAs = register(player);
+        const { settings, flying, view, at, began } = JSON.parse(sessionStorage.getItem(kept(player))) ?? {};
+        if (!settings) return null;
+        // A page that began at the same time is still the same: it made this player, or its frame, anew.
+        const changed = around.map((page, k) => page.began !== began[k]);
+        const again = around.some((page, k) => page.again && changed[k]) || crossSite && changed[0] && Date.now() - at < FRAME_MS;
+        if (!again) return null;
         sessionStorage.removeItem(kept(player));
-        for (const name of Object.keys(player.settings)) player.settings[name] = settings?.[name] ?? player.settings[name];
+        for (const name of Object.keys(player.settings)) player.settings[name] = settings[name] ?? player.settings[name];
         player.set("flying", !!flying);
         return view ?? null;
     } catch (e) {
@@ -143,7 +178,7 @@ export function build(container, player) {
         const link = player.link();
         let failed = "In address bar";
         // A frame of `srcdoc` has no address to change.
-        try { history.replaceState(null, "", link); } catch { failed = "Not copied"; }
+        try { history.replaceState(history.state, "", link); } catch { failed = "Not copied"; }
         try { await navigator.clipboard.writeText(link); share.textContent = "Copied"; } catch { share.textContent = failed; }
         setTimeout(() => { share.textContent = "Copy link"; }, 1500);
         if (player.source instanceof Blob) ui.note("The link has time and pose, but not the file: who follows it has to open the file, too.");
@@ -162,6 +197,8 @@ export function build(container, player) {
         help,
         stats);
     panel.removeAttribute("title");
+    // Controls of time, which a model without motion does not need.
+    const playable = on => [...bar.querySelectorAll("button, input, select"), narrowSpeed].forEach(c => { c.disabled = !on; });
     const note = element("div", { className: "note", attributes: { role: "status" } });
     const progress = element("div", { className: "progress", hidden: true, attributes: { role: "progressbar", "aria-label": "Loading" } });
     const top = element("div", { className: "top" }, title, openLabel, gear);
@@ -212,7 +249,7 @@ export function build(container, player) {
         facts: facts => {
             note.hidden = true;
             const still = facts.frames < 2;
-            bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = still; });
+            playable(!still);
             time.step = still ? 1 : 0.0005;
             cameras(facts.cameras);
             // All degrees of one model mean all degrees of the next.
@@ -224,7 +261,7 @@ export function build(container, player) {
         },
         /// There is nothing to play or to look at.
         empty: () => {
-            bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = true; });
+            playable(false);
             cameras([]);
             clock.textContent = "–";
             stats.textContent = "";

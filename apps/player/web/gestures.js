@@ -67,11 +67,13 @@ const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -
 
 /// What `player` does at a key; `act` moves its camera.
 export function commandsOf(player, act) {
+    // A single frame has no first and last one.
+    const go = time => { if (player.drawnFacts?.frames > 1) player.seek(time); };
     const turn = (right, upwards) => (act.mode() === "fly" ? act.look : act.orbit)(right, upwards);
     return {
         " ": () => player.toggle(), "k": () => player.toggle(), ",": () => player.step(-1), ".": () => player.step(1),
         ArrowLeft: () => turn(-0.08, 0), ArrowRight: () => turn(0.08, 0), ArrowUp: () => turn(0, 0.08), ArrowDown: () => turn(0, -0.08),
-        "+": () => act.zoom(1.1), "=": () => act.zoom(1.1), "-": () => act.zoom(1 / 1.1), Home: () => player.seek(0), End: () => player.seek(1),
+        "+": () => act.zoom(1.1), "=": () => act.zoom(1.1), "-": () => act.zoom(1 / 1.1), Home: () => go(0), End: () => go(1),
         "r": () => player.reset(), "f": () => player.set("flying", !player.flying), "t": () => player.set("tint", !player.settings.tint),
         "z": () => player.set("depth", !player.settings.depth), "p": () => player.savePng(), "Escape": () => player.ui.dismiss(),
         "?": () => player.ui.help(),
@@ -87,8 +89,10 @@ export function addKeys(element, act, commands, signal) {
         // macOS tells of no key that is released while Cmd is held.
         if (e.metaKey) held.clear();
         // Another player, inside of this one's page, has acted on it.
-        if (e.defaultPrevented || e.ctrlKey || e.metaKey || e.altKey || e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
+        if (e.defaultPrevented || e.ctrlKey || e.metaKey || e.altKey) return;
         const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
+        // Lists choose by letters.
+        if (key !== "Escape" && e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
         if (FLY[key]) { held.add(key); e.preventDefault(); return; }
         // Sliders keep the keys that move them, buttons and boxes those that press them.
         const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input, summary") && (key === " " || key === "Enter");

@@ -3,6 +3,7 @@
 //     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });   // src: an address, a File, or bytes with { name }
 //     player.on("time", ({ time, frame }) => …);  player.seek(0.5);  player.play();  await player.load("other.cc4d");
 //     player.destroy();   // gives the device, memory and the element back
+//     createPlayer(element, { src, remember: false });   // does not go on as it was where its page is loaded again
 //
 // Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" and "warning" { message }, "progress" { share, bytes }, "recovered".
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
@@ -29,7 +30,7 @@ export async function createPlayer(container, options = {}) {
     const { src = query.get("src") ?? undefined, autoplay = query.has("autoplay"), backend = query.get("backend") } = options;
     const player = new Page(container, backend);
     player.own = src;
-    const view = restore(player);
+    const view = options.remember === false ? null : restore(player);
     try {
         // Another player may have it where this one could not fetch it.
         ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined).catch(e => {
@@ -90,7 +91,7 @@ class Page {
         if (!this.flyKeys) {
             // On a page of its own the player has the keys before anything was clicked.
             this.flyKeys = addKeys(embedded ? root : document, act, commandsOf(this, act), signal);
-            if (!embedded) remember(this, signal);
+            remember(this, signal);
             this.request = requestAnimationFrame(now => this.loop(now));
         }
         this.resize();

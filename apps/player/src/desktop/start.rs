@@ -1,7 +1,7 @@
 //! The time and the pose that a window begins at, as the options of a command.
 
-use crate::Navigator;
-use crate::navigator::POSE_FOV;
+use crate::navigator::{POSE_ASPECT, POSE_FOV};
+use crate::{Navigator, Pose};
 use cc4dgs_format::{Error, Result};
 use std::path::Path;
 
@@ -10,23 +10,24 @@ use std::path::Path;
 pub struct Start {
     /// Normalised time, 0..1, at which it stands still.
     pub time: Option<f32>,
-    /// A pose of [`Navigator::pose`].
-    pub pose: Option<[f64; 8]>,
+    /// A pose of [`Navigator::pose_shown`].
+    pub pose: Option<Pose>,
 }
 
 impl Start {
-    /// Reads a pose as links of the page have it: seven numbers with commas between, or eight where the image is rolled.
+    /// Reads a pose as links of the page have it: seven numbers with commas between, or nine with roll and aspect.
     ///
     /// # Errors
     /// [`Error::Parameter`] for text that is none, and for poses that see nothing.
-    pub fn parse_pose(text: &str) -> Result<[f64; 8]> {
-        let remedy = "Write EYE_X,EYE_Y,EYE_Z,TARGET_X,TARGET_Y,TARGET_Z,FOV_Y[,ROLL] with angles in radians, as a shared link has it";
+    pub fn parse_pose(text: &str) -> Result<Pose> {
+        let remedy = "Write EYE_X,EYE_Y,EYE_Z,TARGET_X,TARGET_Y,TARGET_Z,FOV_Y[,ROLL[,ASPECT]] with angles in radians, as a shared link has it";
         let wrong = |problem: String| Error::parameter("pose", problem, remedy);
         let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse().map_err(|_| wrong(format!("{v:?} is no number")))).collect::<Result<_>>()?;
-        let pose = Navigator::pose_of(&numbers).ok_or_else(|| wrong(format!("it has {} numbers, not 7 or 8", numbers.len())))?;
+        let pose = Navigator::pose_of(&numbers).ok_or_else(|| wrong(format!("it has {} numbers, not 7 to 9", numbers.len())))?;
         let sees = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]).set_pose(pose);
-        let angles = || format!("{:e} to {}", POSE_FOV.start(), POSE_FOV.end());
-        if sees { Ok(pose) } else { Err(wrong(format!("a number is not finite, eye and target are one point, or the angle is not from {}", angles()))) }
+        let angles = format!("the angle is not from {:e} to {}", POSE_FOV.start(), POSE_FOV.end());
+        let aspects = format!("the aspect is not from {:e} to {:e}", POSE_ASPECT.start(), POSE_ASPECT.end());
+        if sees { Ok(pose) } else { Err(wrong(format!("a number is not finite, eye and target are one point, {angles}, or {aspects}"))) }
     }
     /// Reads a normalised time.
     ///
@@ -71,7 +72,9 @@ mod tests {
         assert_eq!(command, r"cc4dgs view 'it'\''s here/a.cc4d' --time 0.37 --pose=500001,5199997.5,0.333333,500000,5200000,0,0.9");
         let read = Start::parse_pose(command.split_once("--pose=").unwrap().1).unwrap();
         assert!(read.iter().zip(pose).all(|(a, b)| (a - b).abs() < 1e-6), "{read:?}");
-        assert_eq!(Start::parse_pose("3,0,0,0,0,0,0.9,-0.25").unwrap(), [3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, -0.25]);
+        assert_eq!(Start::parse_pose("3,0,0,0,0,0,0.9,-0.25").unwrap(), [3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, -0.25, 0.0]);
+        let wide = Start { time: None, pose: Some(Start::parse_pose("3,0,0,0,0,0,0.9,0,1.6").unwrap()) };
+        assert_eq!(wide.command("cc4dgs view", Path::new("a.cc4d")), "cc4dgs view a.cc4d --pose=3,0,0,0,0,0,0.9,0,1.6");
         assert_eq!(Start::default().command("cc4dgs view", Path::new("runs/mutant")), "cc4dgs view runs/mutant");
     }
 
@@ -84,7 +87,14 @@ mod tests {
     #[test]
     fn poses_and_times_that_mean_nothing_are_refused() {
         let (point, angle) = ("one point", "from 1e-9 to 3.1");
-        let wrong = [("1,2,3", "3 numbers"), ("a,0,0,0,0,0,1", "\"a\""), ("1,1,1,1,1,1,0.9", point), ("0,0,0,1,0,0,9", angle), ("NaN,0,0,1,0,0,1", point)];
+        let wrong = [
+            ("1,2,3", "3 numbers"),
+            ("a,0,0,0,0,0,1", "\"a\""),
+            ("1,1,1,1,1,1,0.9", point),
+            ("0,0,0,1,0,0,9", angle),
+            ("NaN,0,0,1,0,0,1", point),
+            ("0,0,0,1,0,0,1,0,-2", "the aspect is not from 1e-10 to 1e10"),
+        ];
         for (text, said) in wrong {
             let message = Start::parse_pose(text).unwrap_err().to_string();
             assert!(message.contains(said), "{text}: {message}");

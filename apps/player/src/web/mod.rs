@@ -302,17 +302,17 @@ impl Player {
             self.navigator.go_to(camera);
         }
     }
-    /// Eye, target, vertical angle and roll: eight numbers.
+    /// The pose that leads back to exactly this view: nine numbers.
     #[wasm_bindgen(getter)]
     pub fn pose(&self) -> Vec<f64> {
         self.navigator.pose().to_vec()
     }
-    /// The pose as links have it.
+    /// The pose of what the canvas shows, as links have it.
     #[wasm_bindgen(getter, js_name = poseText)]
     pub fn pose_text(&self) -> String {
-        Navigator::pose_text(self.navigator.pose())
+        Navigator::pose_text(self.navigator.pose_shown(self.size.0, self.size.1))
     }
-    /// Takes a pose of the getter; without roll it may have seven numbers. Others are ignored.
+    /// Takes a pose of the getter, or one of seven or eight numbers, without aspect, or without roll and aspect. Others are ignored.
     #[wasm_bindgen(setter)]
     pub fn set_pose(&mut self, pose: Vec<f64>) {
         if let Some(pose) = Navigator::pose_of(&pose) {

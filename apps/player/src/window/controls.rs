@@ -184,6 +184,12 @@ impl Window {
     fn turn(&mut self, right: f64, upwards: f64) {
         if self.flying { self.navigator.look(right, upwards) } else { self.navigator.orbit(right, upwards) }
     }
+    /// Goes to a normalised time where there is more than one frame.
+    fn go(&mut self, time: f32) {
+        if self.clock.frames > 1 {
+            self.clock.seek(time);
+        }
+    }
     pub(super) fn keys(&mut self, ctx: &egui::Context, elapsed_s: f64) {
         use egui::{Event, Key};
         // Whatever has the focus of the Tab key takes the keys.
@@ -193,8 +199,8 @@ impl Window {
         let again: [(Key, Act); 11] = [
             (Key::Comma, |w| w.clock.step(-1)),
             (Key::Period, |w| w.clock.step(1)),
-            (Key::Home, |w| w.clock.seek(0.0)),
-            (Key::End, |w| w.clock.seek(1.0)),
+            (Key::Home, |w| w.go(0.0)),
+            (Key::End, |w| w.go(1.0)),
             (Key::ArrowLeft, |w| w.turn(-TURN, 0.0)),
             (Key::ArrowRight, |w| w.turn(TURN, 0.0)),
             (Key::ArrowUp, |w| w.turn(0.0, TURN)),

@@ -34,7 +34,7 @@ impl Window {
     }
     /// The command that opens this file at this time and pose, where there is a file.
     pub(super) fn command(&self) -> Option<String> {
-        let start = Start { time: Some(self.clock.time), pose: Some(self.navigator.pose()) };
+        let start = Start { time: Some(self.clock.time), pose: Some(self.navigator.pose_shown(self.drawn.0, self.drawn.1)) };
         self.source.as_ref().map(|source| start.command(&source.command, &source.path))
     }
     /// Writes the command that opens this file at this time and pose to standard output, and shows it. Clipboards need a library per window system, which is not here.
