@@ -7,8 +7,8 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    AttributeSpec, Camera, CodecContext, Deformer, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Result, Schedule, Seed, Silent, SpatialInput,
-    Split, StepSettings, View, WeightArray, split_kind, toml,
+    AttributeSpec, Camera, CodecContext, Deformer, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Registry, Result, Schedule, Seed, Silent,
+    SpatialInput, Split, StepSettings, View, WeightArray, toml,
 };
 
 /// Centres per deformer.
@@ -37,7 +37,7 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
 
 /// Times at the ends and beyond, and centres in the box, on the faces of voxels, in the corners of the box, and outside.
 fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Result<()> {
-    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
+    let (context, settings) = (context(), toml::Table::new());
     let part = format!("deformer {name}");
     let conditions: [Centres; 5] = [
         ("centres in the box", true, |i| [0, 1, 2].map(|k| 0.9 * uniform(Seed::root(3).index(i as u64), k))),
@@ -50,17 +50,17 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Re
     for (condition, ordinary, centre) in conditions {
         let means: Vec<f32> = (0..POINTS).flat_map(centre).collect();
         let exact = if Exact::knows(name) {
-            let deformer = shaken(job, name, &context, job.host)?;
+            let deformer = shaken(job.registry, name, &settings, &context, job.host)?;
             let columns = attribute_values(deformer.as_ref());
             let row = |i: usize| columns.iter().flat_map(|(width, values)| values[i * width..(i + 1) * width].to_vec()).collect();
-            Some(Exact::new(name, deformer.as_ref(), &context, &means, &(0..POINTS).map(row).collect::<Vec<_>>())?)
+            Some(Exact::new(name, &settings, deformer.as_ref(), &context, &means, &(0..POINTS).map(row).collect::<Vec<_>>())?)
         } else {
             None
         };
         // The ends and no number first: a device with fewer levels still tries them.
         for time in [0.0f32, 1.0, f32::NAN, 2.0, 0.5, 1.0f32.next_up(), -1.0, 1e6].into_iter().take(job.deformer_levels) {
             let values = |device: &Device| -> Result<Vec<f32>> {
-                let deformer = shaken(job, name, &context, device)?;
+                let deformer = shaken(job.registry, name, &settings, &context, device)?;
                 let tensor = |values: Vec<f32>, width: usize| Tensor::<2>::from_data(TensorData::new(values, [POINTS, width]), device);
                 let attributes = attribute_values(deformer.as_ref()).into_iter().map(|(width, values)| tensor(values, width)).collect();
                 let input = SpatialInput { means_world: tensor(means.clone(), 3), attributes };
@@ -86,10 +86,14 @@ fn compared(job: &StressJob, values: impl Fn(&Device) -> Result<Vec<f32>>, exact
     Ok((found, oracle))
 }
 
-/// The deformer called `name` with its default settings. Fresh ones are the identity, whatever they are asked, so noise is added to all weights.
-fn shaken(job: &StressJob, name: &str, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
-    let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
-    let mut deformer = (job.registry.deformer(&kind)?.build)(&settings, context, device)?;
+/// What deformers are built for.
+fn context() -> DeformerContext {
+    DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) }
+}
+
+/// The deformer called `name` with these `settings`. Fresh ones are the identity, whatever they are asked, so noise is added to all weights.
+fn shaken(registry: &Registry, name: &str, settings: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
+    let mut deformer = (registry.deformer(name)?.build)(settings, context, device)?;
     for (index, parameter) in deformer.parameters_mut().into_iter().enumerate() {
         let count = parameter.value.dims()[0];
         let noise: Vec<f32> = (0..count).map(|k| 0.1 * uniform(Seed::root(13).index(index as u64), k)).collect();
@@ -185,5 +189,43 @@ fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
         };
         let exploded = case(&format!("loss {name}"), "exploding images", format!("{level:e}"), || compared(job, values, exact));
         note(exploded.required_if(level == 1.0));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn formulas_follow_the_settings_of_the_bands_of_time() {
+        let (registry, device, context) = (Registry::collect().unwrap(), Device::flex(), context());
+        let means: Vec<f32> = (0..3 * 12).map(|k| 0.9 * uniform(Seed::root(3), k)).collect();
+        // No default: `cdf` has one cycle without falloff, the others one cycle with a falloff of 1.
+        for (name, settings) in
+            [("cdf", "cycles = 0.5\nfalloff = 1.0"), ("cdf-basis", "cycles = 0.5\nfalloff = 0.5"), ("hash-basis", "cycles = 2.0\nfalloff = 0.0")]
+        {
+            let settings: toml::Table = settings.parse().unwrap();
+            let deformer = shaken(&registry, name, &settings, &context, &device).unwrap();
+            let points = Tensor::<2>::from_data(TensorData::new(means.clone(), [12, 3]), &device);
+            let features = deformer.spatial(&SpatialInput::new(points)).unwrap().values;
+            let formulas = |settings: &toml::Table| Exact::new(name, settings, deformer.as_ref(), &context, &means, &[]).unwrap();
+            let (exact, of_defaults) = (formulas(&settings), formulas(&toml::Table::new()));
+            for time in [0.3, 0.85] {
+                let found = to_vec(deformer.deform(features.clone(), time).unwrap().concatenated().unwrap(), "offsets").unwrap();
+                let error = |exact: &Exact| case(name, "", "", || Ok((found.clone(), Some((FLOAT64, exact.at(time)?))))).error.unwrap();
+                assert!((1e-12..1e-4).contains(&error(&exact)), "{name} at {time}: {:e}", error(&exact));
+                assert!(error(&of_defaults) > 1e-3, "{name} at {time}: the settings change nothing, {:e}", error(&of_defaults));
+            }
+        }
+    }
+
+    #[test]
+    fn settings_that_formulas_do_not_read_are_refused() {
+        let (registry, device, context) = (Registry::collect().unwrap(), Device::flex(), context());
+        for (name, settings, key) in [("cdf", "cycles = 0.5\nlevels = 2", "levels"), ("deform-mlp", "cycles = 0.5", "cycles")] {
+            let deformer = shaken(&registry, name, &toml::Table::new(), &context, &device).unwrap();
+            let refused = Exact::new(name, &settings.parse().unwrap(), deformer.as_ref(), &context, &[], &[]).err().unwrap().to_string();
+            assert!(refused.contains(name) && refused.contains(&format!("setting {key}")), "{refused}");
+        }
     }
 }

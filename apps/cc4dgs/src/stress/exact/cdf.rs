@@ -8,11 +8,16 @@ use cc4dgs_core::{DeformerContext, Result, config, toml};
 use cc4dgs_deformers::cdf::CdfConfig;
 use cc4dgs_deformers::parts::heads::Head;
 use cc4dgs_deformers::parts::voxels::VoxelSettings;
+use serde::Deserialize;
 use std::f64::consts::TAU;
 
+/// The settings that the formulas read, of each of the three: those of the bands of time.
+pub const SETTINGS: &[&str] = &["cycles", "falloff"];
 /// Bands, learned functions and heads of `cdf-basis` and `hash-basis`.
 const MOST_BANDS: usize = 6;
 const LEARNED: usize = 16;
+/// Falloff of the bands that the network of the learned functions reads, whatever the setting.
+const NETWORK_FALLOFF: f32 = 1.0;
 /// Widths of the hidden layers of the coefficient network of each. The functions' network has two layers of the last width.
 const CDF_BASIS: &[usize] = &[128, 128];
 const HASH_BASIS: &[usize] = &[64];
@@ -30,6 +35,7 @@ struct Cdf {
 
 struct Basis {
     bands: usize,
+    settings: BandSettings,
     weights: Weights,
     /// Hidden layers of the coefficient network.
     hidden: &'static [usize],
@@ -37,29 +43,49 @@ struct Basis {
     features: Rows,
 }
 
+/// [`SETTINGS`] of `cdf-basis` and `hash-basis`.
+#[derive(Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct BandSettings {
+    cycles: f32,
+    falloff: f32,
+}
+
+impl Default for BandSettings {
+    fn default() -> Self {
+        Self { cycles: 1.0, falloff: 1.0 }
+    }
+}
+
 /// `cdf`.
 pub fn build(inputs: Inputs) -> Result<Box<dyn Formula>> {
-    let Inputs { weights, context, points, .. } = inputs;
-    let config: CdfConfig = config::parse_section("deformer cdf", &toml::Table::new())?;
+    let Inputs { settings, weights, context, points, .. } = inputs;
+    let config: CdfConfig = config::parse_section("deformer cdf", &settings)?;
     let features = voxels(&config.voxels, &context, &points, &weights)?;
     Ok(Box::new(Cdf { config, context, weights, features }))
 }
 
 /// `cdf-basis`.
 pub fn build_basis(inputs: Inputs) -> Result<Box<dyn Formula>> {
-    let Inputs { weights, context, points, .. } = inputs;
+    let Inputs { settings, weights, context, points, .. } = inputs;
     let features = voxels(&VoxelSettings::default(), &context, &points, &weights)?;
-    Ok(Box::new(Basis { bands: bands_for(context.frame_count).min(MOST_BANDS), weights, hidden: CDF_BASIS, features }))
+    basis(&settings, weights, &context, CDF_BASIS, features)
 }
 
 /// `hash-basis`. Points outside the box are moved to its nearest face.
 pub fn build_hash_basis(inputs: Inputs) -> Result<Box<dyn Formula>> {
-    let Inputs { weights, context, points, .. } = inputs;
+    let Inputs { settings, weights, context, points, .. } = inputs;
     let (levels, base, features, most_rows) = GRID;
     let grid = HashGrid::<3>::new((0..levels).map(|level| [f64::from((base << level) - 1); 3]), most_rows, features, 0.0, false);
     let table = weights.of("grid.table")?;
     let features = points.iter().map(|point| grid.features(table, in_box(point, &context).map(|x| x.clamp(0.0, 1.0)))).collect();
-    Ok(Box::new(Basis { bands: bands_for(context.frame_count).min(MOST_BANDS), weights, hidden: HASH_BASIS, features }))
+    basis(&settings, weights, &context, HASH_BASIS, features)
+}
+
+/// What `cdf-basis` and `hash-basis` have in common: everything after the features of space.
+fn basis(settings: &toml::Table, weights: Weights, context: &DeformerContext, hidden: &'static [usize], features: Rows) -> Result<Box<dyn Formula>> {
+    let settings = config::parse_section("bands of cdf-basis and hash-basis", settings)?;
+    Ok(Box::new(Basis { bands: bands_for(context.frame_count).min(MOST_BANDS), settings, weights, hidden, features }))
 }
 
 /// Hash signatures of the eight corners, a decoder per level, trilinear interpolation. Points outside the box are moved to its nearest face.
@@ -87,7 +113,8 @@ impl Formula for Cdf {
     fn offsets(&self, t: f64) -> Result<Rows> {
         let sizes = self.config.sizes(&self.context)?;
         let w = sizes.width;
-        let time = encode(t, sizes.time_bands, |_| 1.0);
+        let network = &self.config.network;
+        let time = encode(t, sizes.time_bands, network.cycles, network.falloff);
         let mut widths = vec![time.len()];
         widths.extend(sizes.time.trunk.iter().chain(sizes.time.heads.iter().flatten()));
         let f_time = chain(time, self.weights.of("net.time")?, &widths, false);
@@ -102,7 +129,7 @@ impl Formula for Cdf {
                 let widths = [w, w, head.width(self.context.sh_degree)];
                 Ok(chain(hidden.clone(), self.weights.of(&format!("net.head.{}", head.name()))?, &widths, false))
             };
-            Ok(self.config.network.heads.iter().map(head).collect::<Result<Rows>>()?.concat())
+            Ok(network.heads.iter().map(head).collect::<Result<Rows>>()?.concat())
         };
         self.features.iter().map(row).collect()
     }
@@ -111,10 +138,12 @@ impl Formula for Cdf {
 impl Formula for Basis {
     /// Coefficients per Gaussian times functions that all share: 1, t, bands, and those of a network.
     fn offsets(&self, t: f64) -> Result<Rows> {
-        let encoding = encode(t, self.bands, |band| (-(band as f64)).exp2());
+        let encoded = |falloff: f32| encode(t, self.bands, self.settings.cycles, falloff);
         let w = self.hidden.last().copied().unwrap_or(0);
-        let learned = chain(encoding.clone(), self.weights.of("net.functions")?, &[encoding.len(), w, w, LEARNED], false);
-        let functions = [vec![1.0], encoding, learned].concat();
+        let input = encoded(NETWORK_FALLOFF);
+        let widths = [input.len(), w, w, LEARNED];
+        let learned = chain(input, self.weights.of("net.functions")?, &widths, false);
+        let functions = [vec![1.0], encoded(self.settings.falloff), learned].concat();
         let row = |features: &Vec<f64>| {
             let trunk: Vec<usize> = std::iter::once(features.len()).chain(self.hidden.iter().copied()).collect();
             let hidden = chain(features.clone(), self.weights.of("net.trunk")?, &trunk, true);
@@ -134,11 +163,13 @@ fn bands_for(frames: usize) -> usize {
     (frames.max(1) as f64).log2().round().clamp(1.0, 16.0) as usize
 }
 
-/// t, then sine and cosine of each doubling frequency times the band's amplitude.
-fn encode(t: f64, bands: usize, amplitude: impl Fn(usize) -> f64) -> Vec<f64> {
+/// t, then sine and cosine of each band: `cycles` cycles per sequence in the lowest, twice as many in each higher one, whose amplitude is 2^-`falloff` times
+/// that of the one below.
+fn encode(t: f64, bands: usize, cycles: f32, falloff: f32) -> Vec<f64> {
     let pair = |band: usize| {
-        let (sin, cos) = (TAU * (t * (band as f64).exp2()).fract()).sin_cos();
-        [amplitude(band) * sin, amplitude(band) * cos]
+        let (sin, cos) = (TAU * (t * f64::from(cycles) * (band as f64).exp2()).fract()).sin_cos();
+        let amplitude = (-f64::from(falloff) * band as f64).exp2();
+        [amplitude * sin, amplitude * cos]
     };
     std::iter::once(t).chain((0..bands).flat_map(pair)).collect()
 }

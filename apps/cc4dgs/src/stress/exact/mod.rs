@@ -1,4 +1,4 @@
-//! Deformers and loss terms in float64: their plain formulas, with the default settings. Slow and obvious.
+//! Deformers and loss terms in float64: their plain formulas, with the default settings but for those that [`FORMULAS`] names. Slow and obvious.
 //!
 //! Weights and attributes are read from a deformer by name, as float32; everything computed from them, from centres and from times is float64. Nothing is
 //! shared with the kernels but the hash signatures of vertices (integers, scaled) and the shapes of layers.
@@ -16,7 +16,7 @@ mod network;
 mod swift4d;
 
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, Error, Result};
+use cc4dgs_core::{Deformer, DeformerContext, Error, Result, toml};
 use std::collections::BTreeMap;
 
 /// A row of values per Gaussian.
@@ -33,6 +33,8 @@ pub trait Formula {
 
 /// What a [`Formula`] is built from.
 pub struct Inputs {
+    /// Settings of the deformer: some of those that [`FORMULAS`] names. All others are the defaults.
+    settings: toml::Table,
     weights: Weights,
     context: DeformerContext,
     /// Centres, world units.
@@ -43,18 +45,18 @@ pub struct Inputs {
 
 type Build = fn(Inputs) -> Result<Box<dyn Formula>>;
 
-/// The deformers that have formulas, by name.
-const FORMULAS: [(&str, Build); 10] = [
-    ("cdf", cdf::build),
-    ("cdf-basis", cdf::build_basis),
-    ("deform-mlp", deform_mlp::build),
-    ("embedding", embedding::build),
-    ("free-time", free_time::build),
-    ("grid4d", grid4d::build),
-    ("hash-basis", cdf::build_hash_basis),
-    ("hexplane", hexplane::build),
-    ("native-4d", native4d::build),
-    ("swift4d-hash", swift4d::build),
+/// The deformers that have formulas, by name, with the settings that the formulas read.
+const FORMULAS: [(&str, Build, &[&str]); 10] = [
+    ("cdf", cdf::build, cdf::SETTINGS),
+    ("cdf-basis", cdf::build_basis, cdf::SETTINGS),
+    ("deform-mlp", deform_mlp::build, &[]),
+    ("embedding", embedding::build, &[]),
+    ("free-time", free_time::build, &[]),
+    ("grid4d", grid4d::build, &[]),
+    ("hash-basis", cdf::build_hash_basis, cdf::SETTINGS),
+    ("hexplane", hexplane::build, &[]),
+    ("native-4d", native4d::build, &[]),
+    ("swift4d-hash", swift4d::build, &[]),
 ];
 
 /// A deformer whose offsets are computed in float64.
@@ -65,16 +67,21 @@ pub struct Exact {
 impl Exact {
     /// Whether there are formulas of the deformer called `name`.
     pub fn knows(name: &str) -> bool {
-        FORMULAS.into_iter().any(|(known, _)| known == name)
+        FORMULAS.into_iter().any(|(known, ..)| known == name)
     }
-    /// The formulas of `deformer`, which was built as `name` with the default settings, for `means` `[M,3]` and `attributes` by row.
+    /// The formulas of `deformer`, which was built as `name` with these `settings`, for `means` `[M,3]` and `attributes` by row.
     ///
     /// # Errors
-    /// [`Error::Backend`] where there are no formulas of it, or where it lacks a weight that they read.
-    pub fn new(name: &str, deformer: &dyn Deformer, context: &DeformerContext, means: &[f32], attributes: &[Vec<f32>]) -> Result<Self> {
-        let Some((_, build)) = FORMULAS.into_iter().find(|(known, _)| *known == name) else {
+    /// [`Error::Backend`] where there are no formulas of it, or where it lacks a weight that they read; [`Error::Parameter`] for a setting that they do not
+    /// read.
+    pub fn new(name: &str, settings: &toml::Table, deformer: &dyn Deformer, context: &DeformerContext, means: &[f32], attributes: &[Vec<f32>]) -> Result<Self> {
+        let Some((_, build, read)) = FORMULAS.into_iter().find(|(known, ..)| *known == name) else {
             return Err(Error::backend("stress", format!("there are no formulas of the deformer {name}"), "Report this as a defect"));
         };
+        if let Some(key) = settings.keys().find(|key| !read.contains(&key.as_str())) {
+            let problem = format!("the float64 formulas of the deformer {name} do not read the setting {key}");
+            return Err(Error::parameter("stress", problem, "Leave it out: they are those of its default"));
+        }
         let mut weights = BTreeMap::new();
         for parameter in deformer.parameters() {
             let values = to_vec(parameter.value.clone(), "weights")?;
@@ -82,7 +89,8 @@ impl Exact {
         }
         let points = means.as_chunks::<3>().0.iter().map(|p| p.map(f64::from)).collect();
         let attributes = attributes.iter().map(|row| row.iter().map(|v| f64::from(*v)).collect()).collect();
-        Ok(Self { formula: build(Inputs { weights: Weights(weights), context: context.clone(), points, attributes })? })
+        let inputs = Inputs { settings: settings.clone(), weights: Weights(weights), context: context.clone(), points, attributes };
+        Ok(Self { formula: build(inputs)? })
     }
     /// All offsets at a time, row by row, in the order of [`cc4dgs_core::Offsets::concatenated`].
     ///
@@ -128,7 +136,7 @@ mod tests {
     fn every_deformer_but_none_and_every_loss_term_has_formulas() {
         let plugins = Registry::collect().unwrap().plugins();
         let registered = |kind: &str| plugins.iter().filter(|(of, _)| *of == kind).map(|(_, plugin)| plugin.name).collect::<BTreeSet<&str>>();
-        let deformers: BTreeSet<&str> = FORMULAS.into_iter().map(|(name, _)| name).chain(["none"]).collect();
+        let deformers: BTreeSet<&str> = FORMULAS.into_iter().map(|(name, ..)| name).chain(["none"]).collect();
         let terms: BTreeSet<&str> = losses::TERMS.into_iter().map(|(name, _)| name).collect();
         assert_eq!((registered("deformer"), registered("loss")), (deformers, terms));
         assert!(Exact::knows("swift4d-hash") && !Exact::knows("none"));
