@@ -169,8 +169,8 @@ impl<'a> Coded<'a> {
     }
 }
 
-/// The largest step with which the stored rows of an attribute are within `tolerance`. It is not above 0 where none is small enough, because rounding to float32
-/// alone may change large values by as much.
+/// The largest step with which the stored rows of an attribute are within `tolerance`. It is not above 0 where none is small enough, because rounding to
+/// float32 alone may change large values by as much.
 fn largest_step(attribute: &ExtraAttribute, rows: &[bool], tolerance: f64) -> f64 {
     let stored = attribute.values.chunks_exact(attribute.width.max(1)).zip(rows).filter(|(_, stored)| **stored);
     let largest = stored.flat_map(|(row, _)| row).fold(0.0f32, |largest, v| largest.max(v.abs()));
@@ -302,13 +302,13 @@ fn read_coded(set: &StreamSet, coding: &Coding, kind: u8, rows: &RowFacts, plans
 mod tests {
     use super::*;
     use cc4dgs_format::Seed;
+    use cc4dgs_format::conformance::uniform;
 
     /// The largest error of values from `middle` - 1 to `middle` + 1 that may have one of `tolerance`; `None` where they are not coded.
     fn worst(middle: f32, tolerance: f32) -> Option<f32> {
         let count = 4000;
-        let draw = |k: usize| (Seed::root(5).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
         let mut g = HostGaussians { opacity_logits: vec![0.0; count], ..Default::default() };
-        g.extra.insert("a".into(), ExtraAttribute::exact(1, (0..count).map(|k| middle + draw(k)).collect()).within(tolerance));
+        g.extra.insert("a".into(), ExtraAttribute::exact(1, (0..count).map(|k| middle + uniform(Seed::root(5), k)).collect()).within(tolerance));
         let (columns, geometry) = (Columns::from(&g), Geometry::new(0.0, 1.0, 1.0, 1.0));
         // Images say that steps may be as large as they like.
         let sensitivity = Sensitivity { name: "a".into(), growth: Growth::None, weight: 1e-9 };

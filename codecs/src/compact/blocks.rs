@@ -17,8 +17,8 @@ fn ranges(layer: &Range<usize>) -> impl Iterator<Item = Range<usize>> + use<> {
     (0..layer.len().div_ceil(ROWS)).map(move |i| layer.start + i * ROWS..layer.end.min(layer.start + (i + 1) * ROWS))
 }
 
-/// The streams `name` of all layers, of one block per range, each coded by `code` in `contexts` contexts: the u32 length of the distributions, those, the u32
-/// lengths of all blocks but the last, then the blocks.
+/// The streams `name` of all `layers` (ranges of rows), whose blocks of up to [`ROWS`] rows `code` codes in `contexts` contexts: the u32 length of the
+/// distributions, those, the u32 lengths of all blocks but the last, then the blocks.
 pub fn encode(name: &str, contexts: usize, layers: &[Range<usize>], code: impl Fn(&mut Encoder, Range<usize>) -> Result<()> + Sync) -> Result<Vec<Stream>> {
     let note = |range: Range<usize>| {
         let mut encoder = Encoder::default();

@@ -39,7 +39,7 @@ pub struct Degree {
     basis: Basis,
     /// Step of class 0.
     step: f32,
-    /// Root-mean-square coordinate over the step of class 0, in half octaves, plus 128.
+    /// Root-mean-square coordinate over the step of class 0, in half octaves, plus [`ONE_STEP`].
     spread: Vec<u8>,
 }
 
@@ -129,7 +129,7 @@ impl Degree {
     pub fn plan(transform: &Transform, step: f32) -> Self {
         let octaves = |spread: &f64| {
             let relative = spread / f64::from(step);
-            if relative > 0.0 { (2.0 * libm::log2(relative) + 128.0).round().clamp(0.0, 255.0) as u8 } else { 0 }
+            if relative > 0.0 { (2.0 * libm::log2(relative) + f64::from(ONE_STEP)).round().clamp(0.0, 255.0) as u8 } else { 0 }
         };
         let Transform { dims, mean, basis, spread } = transform;
         Self { dims: *dims, mean: mean.clone(), basis: basis.clone(), step, spread: spread.iter().map(octaves).collect() }
@@ -258,8 +258,8 @@ impl Degree {
         let rows = codes.par_chunks_exact(self.dims).zip(classes).zip(sizes);
         rows.for_each(|((codes, &class), size)| *size = size_of(largest_symbol(codes), class));
     }
-    /// Codes the coordinates `[N,dims]` of a block. `sizes` are the sizes of the rows in the degree before, 0 if this is the first, and become those in this one:
-    /// the symbol of the largest magnitude plus twice the class, in half octaves. Sizes of all rows come first; then rows of zeros are known.
+    /// Codes the coordinates `[N,dims]` of a block. `sizes` are the sizes of the rows in the degree before, 0 if this is the first, and become those in this
+    /// one: the symbol of the largest magnitude plus twice the class, in half octaves. Sizes of all rows come first; then rows of zeros are known.
     pub fn code<C: Coder>(&self, coder: &mut C, codes: &mut [i32], classes: &[u8], sizes: &mut [i32], first: bool) -> Result<()> {
         let (dims, rows) = (self.dims, classes.len().min(sizes.len()).min(codes.len() / self.dims.max(1)));
         let (codes, classes, sizes) = (&mut codes[..rows * dims], &classes[..rows], &mut sizes[..rows]);

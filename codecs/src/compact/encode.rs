@@ -10,7 +10,7 @@ use super::write::APART;
 use rayon::prelude::*;
 
 /// The coarsest class.
-pub const CLASSES: u8 = 12;
+const COARSEST_CLASS: u8 = 12;
 /// What Gaussians of larger weights than that of class 0 add to the squared error of images, as a share of what all others do.
 const EXCESS: f64 = 2e-3;
 /// Norms of quaternions outside are stored exactly: an absolute step would be wrong for them.
@@ -114,7 +114,7 @@ pub struct Classes {
 /// Classes by the weights of colours and of shapes.
 pub fn classify(colors: &[f64], shapes: &[f64], adaptive: bool) -> Classes {
     let (colors, top) = octaves(colors, None, adaptive);
-    let apart = |(&shape, &color): (&u8, &u8)| shape.clamp(color.saturating_sub(APART), color + APART).min(CLASSES);
+    let apart = |(&shape, &color): (&u8, &u8)| shape.clamp(color.saturating_sub(APART), color + APART).min(COARSEST_CLASS);
     let shapes = octaves(shapes, Some(top), adaptive).0.iter().zip(&colors).map(apart).collect();
     Classes { colors, shapes, top }
 }
@@ -140,7 +140,8 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
         });
         allowed.last().copied().unwrap_or(sorted[sorted.len() - 1])
     });
-    let class = |w: &f64| if *w > 0.0 { libm::log2(top / w).round().clamp(0.0, f64::from(CLASSES)) as u8 } else { CLASSES };
+    let coarsest = f64::from(COARSEST_CLASS);
+    let class = |w: &f64| if *w > 0.0 { libm::log2(top / w).round().clamp(0.0, coarsest) as u8 } else { COARSEST_CLASS };
     (weights.iter().map(class).collect(), top)
 }
 
@@ -238,7 +239,7 @@ impl Plan {
         let (rotations, exact_rotations) = or_each(keeps[2].then_some((known.rotations, known_rotations)), n, |i| {
             let q = &gaussians.quaternions[4 * i..4 * i + 4];
             let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
-            let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
+            let step = geometry.rotation_step_of(geometry.rotation_shift(scales[i], shapes[i]));
             Some(norm).filter(|norm| self.rounds[2] && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i]))
         });
         let (opacities, exact_opacities) = or_each(keeps[3].then_some((known.opacities, known_opacities)), n, |i| {
@@ -264,18 +265,14 @@ fn or_each<T: Default + Send>(known: Option<(Vec<T>, Vec<usize>)>, n: usize, cod
 
 #[cfg(test)]
 mod tests {
-    use super::super::importance;
     use super::super::plan::{Bounds, Planner};
+    use super::super::{importance, random_gaussians};
     use super::*;
-    use cc4dgs_format::{CodecContext, HostGaussians, Limits, Seed, Silent};
+    use cc4dgs_format::{CodecContext, Limits, Seed, Silent};
 
     #[test]
     fn codes_are_kept_where_a_plan_rounds_colours_as_the_one_before() {
-        let draw = |k: usize, column: usize| (Seed::root(column as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
-        let mut g = HostGaussians { sh_degree: 2, opacity_logits: vec![0.0; 80], ..Default::default() };
-        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
-            *values = (0..80 * width).map(|k| draw(k, column)).collect();
-        }
+        let g = random_gaussians(80, 2);
         let columns = Columns::from(&g);
         let importance = importance::estimate(&g, &CodecContext::new(Seed::root(1), Limits::default(), &Silent));
         let classes = classify(&importance.weights, &importance.shapes, true);
@@ -309,11 +306,7 @@ mod tests {
 
     #[test]
     fn shapes_are_kept_where_a_plan_rounds_them_as_the_one_before() {
-        let draw = |k: usize, column: usize| (Seed::root(column as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
-        let mut g = HostGaussians { opacity_logits: vec![0.0; 80], ..Default::default() };
-        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
-            *values = (0..80 * width).map(|k| draw(k, column)).collect();
-        }
+        let mut g = random_gaussians(80, 0);
         // Rows that no step can hold.
         (g.means[4], g.log_scales[7], g.opacity_logits[9]) = (f32::MAX, 80.0, 70.0);
         g.quaternions[..4].fill(100.0);

@@ -1,7 +1,7 @@
 //! What rounds of fine-tuning are expected to lose, given what those before have lost.
 //!
-//! After k rounds with steps s times those that need no training, the loss in dB is a s² - b - g k: rounding costs in proportion to squared steps, training gains
-//! something at once and something in each round. Of a, b and g there are expectations, which each round corrects (Bayesian linear regression).
+//! After k rounds with steps s times those that need no training, the loss in dB is a s² - b - g k: rounding costs in proportion to squared steps, training
+//! gains something at once and something in each round. Of a, b and g there are expectations, which each round corrects (Bayesian linear regression).
 
 /// Share of the loss by rounding that training leaves.
 const REMAINS: f64 = 0.3;
@@ -46,8 +46,8 @@ impl Forecast {
             self.precision[i].iter_mut().zip(row).for_each(|(sum, other)| *sum += own * other / (NOISE * NOISE));
         }
     }
-    /// The most octaves with which at most `allowed` dB are lost after `round` rounds, even if it is `caution` standard deviations more than expected; minus infinity
-    /// where none do.
+    /// The most octaves with which at most `allowed` dB are lost after `round` rounds, even if it is `caution` standard deviations more than expected; minus
+    /// infinity where none do.
     pub fn octaves(&self, round: usize, allowed: f64, caution: f64) -> f64 {
         let [cost, at_once, gain] = solve(self.precision, self.scaled);
         let loss = |octaves: f64| {

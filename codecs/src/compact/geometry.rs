@@ -12,7 +12,7 @@ use cc4dgs_format::{Error, Result};
 pub const GRID_BITS: u32 = 21;
 /// Codes are smaller in magnitude.
 pub const CODE_LIMIT: i64 = 1 << 24;
-/// Rotations of Gaussians whose scales are within a factor of sqrt(2), 2, 4, 8 and more: steps are halved so many times.
+/// How many times the step of a rotation is halved, or doubled if negative, where largest and smallest scale are about 0, 1, 2, and 3 or more octaves apart.
 const FINER: [i32; 4] = [-2, 1, 2, 3];
 /// Steps of rotations that have contexts of their own, and minus the exponent of the finest.
 const ROTATION_STEPS: usize = 20;
@@ -31,7 +31,7 @@ pub struct Geometry {
     pub scale_origin: f32,
     /// Step of log-scales of class 0.
     pub scale_step: f32,
-    /// Step of quaternion components of class 0 where scales are within a factor of 2.
+    /// Step of quaternion components of class 0, before [`FINER`] changes it.
     pub rotation_step: f32,
     /// Step of companded opacities of class 0.
     pub opacity_step: f32,
@@ -132,9 +132,9 @@ impl Geometry {
         let value = f64::from(code) * self.opacity_step_of(class);
         (if value < 0.0 { value } else { libm::expm1(value) } as f32).clamp(f32::MIN, f32::MAX)
     }
-    /// Step of a rotation.
-    pub fn rotation(&self, shift: i32) -> f64 {
-        f64::from(self.rotation_step) * if shift < 0 { 1.0 / f64::from(1u32 << -shift) } else { f64::from(1u32 << shift) }
+    /// Step of a rotation, for its [`Geometry::rotation_shift`].
+    pub fn rotation_step_of(&self, shift: i32) -> f64 {
+        f64::from(self.rotation_step) * doubled(shift)
     }
     /// The centre of a cell that was enlarged `shift` times.
     pub fn centre(&self, key: u64, shift: u32) -> [f32; 3] {
@@ -153,6 +153,16 @@ impl Geometry {
         }
         Some(key)
     }
+}
+
+/// 1, doubled `shift` times, or halved if negative.
+fn doubled(shift: i32) -> f64 {
+    if shift < 0 { 1.0 / f64::from(1u32 << -shift) } else { f64::from(1u32 << shift) }
+}
+
+/// How many times finer the step of a rotation is where largest and smallest scale are so many octaves apart.
+pub fn rotation_fineness(octaves: usize) -> f64 {
+    doubled(FINER[octaves.min(FINER.len() - 1)])
 }
 
 /// The integer nearest to a number whose magnitude is below 2^31 - 0.5; of two, the one farther from zero, as of [`f64::round`]. It has no branches, which

@@ -3,6 +3,7 @@
 //! Where errors of all parameters add the same to the squared error of images, a file of a given size has the smallest error. A parameter's step is
 //! therefore inversely proportional to its *weight*: the root of the sum, over pixels and channels of an image, of the squared derivatives.
 
+use super::geometry::rotation_fineness;
 use super::joint::Directions;
 use super::sensitivity::Sensitivity;
 use cc4dgs_format::{BLUR, Camera, CodecContext, Event, HostGaussians, Result};
@@ -57,7 +58,7 @@ pub struct Steps {
     pub means: f64,
     /// Of log-scales.
     pub log_scales: f64,
-    /// Of quaternion components where scales are within a factor of 2.
+    /// Of quaternion components, before [`rotation_fineness`] divides it.
     pub quaternions: f64,
     /// Of companded opacities.
     pub opacity_logits: f64,
@@ -79,6 +80,11 @@ fn sizes(log_scales: &[f32]) -> (f64, f64) {
     (libm::exp(s[1].clamp(-60.0, 60.0)), libm::exp(s[2].clamp(-60.0, 60.0)))
 }
 
+/// The middle one of three log-scales.
+pub fn middle_log_scale(row: &[f32]) -> f64 {
+    f64::from(row[0].min(row[1]).max(row[0].max(row[1]).min(row[2])))
+}
+
 /// Weights from sizes and opacities alone, at the distance of the training cameras or of a camera that sees the whole model.
 pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance {
     let (scale, samples) = pixel_scales(gaussians, context);
@@ -93,8 +99,8 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
     Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default(), attributes: Vec::new(), directions: None }
 }
 
-/// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own, `joint` whether directions
-/// are wanted.
+/// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own, `joint` whether
+/// directions are wanted.
 pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool, joint: bool) -> Result<Option<Importance>> {
     let (Some(views), Some(renderer)) = (context.views, context.renderer) else { return Ok(None) };
     let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
@@ -158,7 +164,7 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool, j
         let norm: f64 = q.iter().map(|&v| f64::from(v).powi(2)).sum();
         let s = &gaussians.log_scales[3 * i..3 * i + 3];
         let octaves = f64::from(s.iter().copied().fold(f32::MIN, f32::max) - s.iter().copied().fold(f32::MAX, f32::min)) / std::f64::consts::LN_2;
-        let finer = [0.25, 2.0, 4.0, 8.0][(octaves + 0.5).clamp(0.0, 3.0) as usize];
+        let finer = rotation_fineness((octaves + 0.5).max(0.0) as usize);
         row(&total.quaternions, 4, i) / 3.0 * norm / (finer * finer)
     });
     let opacity_logits = each(&|i| f64::from(total.opacity_logits[i]) * (1.0 + f64::from(gaussians.opacity_logits[i]).max(0.0)).powi(2));

@@ -3,7 +3,7 @@
 //! Cameras see a Gaussian from some sides only, and functions of direction that are orthogonal over the sphere are not so there: what rounding one coefficient
 //! changes, others can undo. With M, the mean over views of y yᵀ times the weight of the Gaussian in the view, where y are the basis functions at the view's
 //! direction, errors e of the coefficients of a channel add eᵀ M e to the squared error of images. Degrees are rounded from the highest to the lowest, each to
-//! the nearest of what is best given the errors of those before (the nearest-plane algorithm of Babai 1986, a degree at a time). Files decode as they always did.
+//! the nearest of what is best given the errors of those before (the nearest-plane algorithm of Babai 1986, a degree at a time). Decoders do not depend on it.
 
 use super::colors::{Choices, Codes, Degree};
 use super::columns::{Columns, Rows};
@@ -17,8 +17,8 @@ const CHANNELS: usize = 3;
 const MOST: usize = 25;
 /// Rows that are rounded at a time.
 const CHUNK: usize = 2048;
-/// All directions count with this share of the mean. Files of mutant with 12,135 Gaussians have 18.6, 18.2, 17.8, 18.1, 18.2 and 18.7 bytes per Gaussian with 0.001, 0.01,
-/// 0.03, 0.05, 0.1 and 0.2: with less, coefficients drift where no view sees it, which costs bits.
+/// All directions count with this share of the mean. Files of mutant with 12,135 Gaussians have 18.6, 18.2, 17.8, 18.1, 18.2 and 18.7 bytes per Gaussian with
+/// 0.001, 0.01, 0.03, 0.05, 0.1 and 0.2: with less, coefficients drift where no view sees it, which costs bits.
 const UNSEEN: f64 = 0.03;
 
 /// The basis functions of the spherical harmonics of degree 0 to 4 at the unit vector `direction`, signs as in Inria's 3DGS.
@@ -57,7 +57,8 @@ fn basis([x, y, z]: [f64; 3]) -> [f64; MOST] {
 pub struct Directions {
     /// Basis functions: (degree + 1)².
     functions: usize,
-    /// Lower triangles, row by row `[N, functions (functions + 1) / 2]`: of M while views are added, then of L, where M is L D Lᵀ and L has ones on its diagonal.
+    /// Lower triangles, row by row `[N, functions (functions + 1) / 2]`: of M while views are added, then of L, where M is L D Lᵀ and L has ones on its
+    /// diagonal.
     triangles: Vec<f32>,
 }
 
@@ -98,8 +99,8 @@ impl Directions {
         });
         self
     }
-    /// Codes of all `degrees` of `gaussians`, which are as many as views were added for. A degree that `rounds` says is not rounded is stored exactly, as are rows that
-    /// are out of range.
+    /// Codes of all `degrees` of `gaussians`, which are as many as views were added for. A degree that `rounds` says is not rounded is stored exactly, as are
+    /// rows that are out of range.
     pub fn quantise(&self, degrees: &[Degree], gaussians: Columns, classes: &[u8], rounds: &[bool], choices: &[Choices]) -> Vec<Codes> {
         let mut values: Vec<Vec<i32>> = degrees.iter().map(|plan| vec![0; classes.len() * plan.dims]).collect();
         // The values of each chunk, by degree.
@@ -157,8 +158,8 @@ impl Directions {
     }
 }
 
-/// What the coefficients of the functions `of` should change by, given the `errors` of those above: with L, Σ d_j (e_j + Σ_{i>j} L_ij e_i)² is least where each of these
-/// sums is 0.
+/// What the coefficients of the functions `of` should change by, given the `errors` of those above: with L, Σ d_j (e_j + Σ_{i>j} L_ij e_i)² is least where each
+/// of these sums is 0.
 fn compensation(lower: &[f32], functions: usize, of: Range<usize>, errors: &[f64; MOST]) -> [f64; MOST] {
     let mut shifts = [0.0; MOST];
     let factor = |row: usize, column: usize| f64::from(lower[start(row) + column]);
@@ -280,7 +281,7 @@ mod tests {
         // What is stored exactly leaves nothing to make up for.
         assert!(directions.quantise(&degrees, columns, &[0], &[true, true, false], &choices)[..2] != together[..2]);
         assert_eq!(directions.quantise(&degrees, columns, &[0], &[false, false, false], &choices), apart);
-        // Without a view, all is as before.
+        // Without a view, coefficients are rounded apart.
         assert_eq!(Directions::new(1, 2).factored().quantise(&degrees, columns, &[0], &[true; 3], &choices), apart);
     }
 }

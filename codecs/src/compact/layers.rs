@@ -8,7 +8,8 @@ use std::ops::Range;
 
 /// Layers that a file may have.
 pub const MOST: usize = 6;
-/// Layers of a large model, and the Gaussians from which it is large: every layer has distributions of its own, and neighbours in space are farther apart in it.
+/// Layers of a large model, and the Gaussians from which it is large: every layer has distributions of its own, and neighbours in space are farther apart in
+/// it.
 const LAYERS: usize = 3;
 const LARGE: usize = 1 << 17;
 

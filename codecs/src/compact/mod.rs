@@ -2,8 +2,8 @@
 //!
 //! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
 //! the class before. Weights come from derivatives of renders in views, or from sizes and opacities. Streams, in the order in which a player
-//! needs them: of each layer classes, scales, centres, rotations, opacities and degree-0 colours, then the higher degrees one by one. Layers are sets of
-//! Gaussians by falling weight. Attributes of plug-ins follow the layers.
+//! needs them: of each layer classes, scales, centres, rotations, opacities and degree-0 colours, then attributes of plug-ins, then the higher degrees one by
+//! one. Layers are sets of Gaussians by falling weight.
 
 mod allocate;
 mod attributes;
@@ -187,6 +187,17 @@ inventory::submit! {
     }
 }
 
+/// `count` Gaussians with values in -1..1.
+#[cfg(test)]
+fn random_gaussians(count: usize, sh_degree: usize) -> HostGaussians {
+    let mut out = HostGaussians { sh_degree, opacity_logits: vec![0.0; count], ..Default::default() };
+    for (column, (_, width, values)) in out.columns_mut().into_iter().enumerate() {
+        let seed = cc4dgs_format::Seed::root(column as u64);
+        *values = (0..count * width).map(|k| cc4dgs_format::conformance::uniform(seed, k)).collect();
+    }
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use super::joint::Directions;
@@ -203,11 +214,7 @@ mod tests {
     #[test]
     fn the_declared_loss_is_kept_by_the_steps_of_what_is_hardly_seen() {
         let n = 400;
-        let draw = |k: usize, column: u64| (cc4dgs_format::Seed::root(column).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
-        let mut g = HostGaussians { sh_degree: 2, opacity_logits: vec![0.0; n], ..Default::default() };
-        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
-            *values = (0..n * width).map(|k| draw(k, column as u64)).collect();
-        }
+        let mut g = random_gaussians(n, 2);
         // Large beside the distances between them, so that steps of a size lose much.
         g.log_scales.fill(0.5);
         let context = CodecContext::new(cc4dgs_format::Seed::root(1), Default::default(), &cc4dgs_format::Silent);

@@ -5,7 +5,7 @@ use super::colors::{Choices, Degree, Transform};
 use super::columns::Columns;
 use super::encode::{Classes, LOG_SCALE_LIMIT};
 use super::geometry::{GRID_BITS, Geometry};
-use super::importance::{Importance, median};
+use super::importance::{Importance, median, middle_log_scale};
 use super::restore::Losses;
 use rayon::prelude::*;
 
@@ -18,7 +18,7 @@ const LARGEST_OPACITY_STEP: f64 = 1.0;
 /// outside may be.
 const OUTSIDE: [(f64, f64); 4] = [(0.0, 1.0), (5e-4, 1.0), (5e-3, 2.0), (5e-2, 4.0)];
 
-/// Steps, grid and transforms: everything that decides how values are rounded.
+/// How the values of a model are rounded, in the steps of one quality.
 pub struct Plan {
     pub geometry: Geometry,
     pub degrees: Vec<Degree>,
@@ -68,7 +68,7 @@ pub struct Planner<'a> {
 impl<'a> Planner<'a> {
     pub fn new(gaussians: Columns<'a>, importance: &'a Importance, classes: &'a Classes, choices: Choices) -> Self {
         let finite = || gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v));
-        let middles = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2]))));
+        let middles = gaussians.log_scales.chunks_exact(3).map(middle_log_scale);
         let middle = median(&middles.collect::<Vec<f64>>());
         let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
         let transform = |degree: usize| Transform::of(gaussians.coefficients(degree), &squared, &choices);
@@ -128,9 +128,9 @@ fn sorted_axes(means: &[f32]) -> [Vec<f32>; 3] {
     axes
 }
 
-/// Chooses the grid of the centres, whose sorted coordinates are `axes`: `relative` is the step of class 0 over the middle scale, `largest` that of the coarsest
-/// class; the logarithm of the middle scale has the median `middle`. A grid of so many cells may be too small for them; then some are left out, or cells are
-/// larger than wanted, and steps of larger Gaussians and coarser classes are doubled less often.
+/// Chooses the grid of the centres, whose sorted coordinates are `axes`: `relative` is the step of class 0 over the middle scale, `largest` that of the
+/// coarsest class; the logarithm of the middle scale has the median `middle`. A grid of so many cells may be too small for them; then some are left out, or
+/// cells are larger than wanted, and steps of larger Gaussians and coarser classes are doubled less often.
 fn grid(geometry: &mut Geometry, axes: &[Vec<f32>; 3], middle: f64, pixels_per_unit: f64, (relative, largest): (f64, f64)) {
     let relative = relative.min(0.5).min(largest).max(1e-9);
     // Below half a pixel all Gaussians look alike.
@@ -146,7 +146,7 @@ fn grid(geometry: &mut Geometry, axes: &[Vec<f32>; 3], middle: f64, pixels_per_u
         }
         best = growth * cost;
         geometry.cell = growth * cell;
-        // Beside the middle ones there is room for some of those that may lie outside.
+        // The grid is centred on the middle ones, and often holds some of those that may lie outside.
         geometry.corner = spans.map(|[low, high]| if cut > 0.0 { 0.5 * (low + high) - 0.5 * cells * geometry.cell } else { low });
         let octaves = libm::log2(growth);
         geometry.size_floor = ((floor / std::f64::consts::LN_2 + octaves) * 65536.0) as i64;

@@ -118,7 +118,7 @@ impl History {
         out[INPUTS - 1] = CONSTANT;
         out
     }
-    /// The `K` inputs of the component `C` that can differ from 0, in the same order: the numbers given are among them if `K` has room for them.
+    /// The `K` inputs of the component `C` that can differ from 0, in the same order: the numbers given are among them if `K` counts them.
     #[inline(always)]
     fn used_inputs<const C: usize, const K: usize>(&self, row: &[i64; DIMS], known: &Known) -> [f64; K] {
         let mut out = [0; K];

@@ -150,7 +150,7 @@ impl Rows {
                 range.map(|i| (self.geometry.rotation_shift(self.scales[i], self.shapes[i]), self.motion.is_free(i, &self.moving))).collect();
             code_rotations(coder, &mut codes, &shifts)?;
             let rows = out.as_chunks_mut::<4>().0.iter_mut().zip(codes).zip(shifts);
-            rows.for_each(|((out, codes), (shift, _))| *out = codes.quaternion(self.geometry.rotation(shift)));
+            rows.for_each(|((out, codes), (shift, _))| *out = codes.quaternion(self.geometry.rotation_step_of(shift)));
             Ok(())
         })?;
         Ok(out)

@@ -32,8 +32,8 @@ pub fn restored(of: &Integers, given: Columns, order: Option<&[usize]>) -> HostG
     }
 }
 
-/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`](cc4dgs_format::storage::column_loss)). Each thread has
-/// one of them in memory, and of the higher degrees a block of rows. Those that are `known` are taken.
+/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`](cc4dgs_format::storage::column_loss)). Each thread
+/// has one of them in memory, and of the higher degrees a block of rows. Those that are `known` are taken.
 pub fn losses(of: &Integers, given: Columns, before: &Losses, known: [Option<f64>; 6]) -> Vec<f64> {
     let loss = |column: usize| {
         if let Some(loss) = known[column] {
@@ -102,7 +102,7 @@ impl Integers<'_> {
     }
     fn quaternions(&self, given: &[f32], order: Order) -> Vec<f32> {
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
-        let step = |i: usize| geometry.rotation(geometry.rotation_shift(self.scales[i], shapes[i]));
+        let step = |i: usize| geometry.rotation_step_of(geometry.rotation_shift(self.scales[i], shapes[i]));
         column(given, 4, &self.exact[2], order, |i, out| out.copy_from_slice(&self.rotations[i].quaternion(step(i))))
     }
     fn opacity_logits(&self, given: &[f32], order: Order) -> Vec<f32> {
@@ -161,18 +161,14 @@ impl Integers<'_> {
 mod tests {
     use super::super::encode::classify;
     use super::super::plan::{Bounds, Planner};
-    use super::super::{Choices, importance};
+    use super::super::{Choices, importance, random_gaussians};
     use super::*;
     use cc4dgs_format::storage::column_loss;
     use cc4dgs_format::{CodecContext, Limits, Seed, Silent};
 
     #[test]
     fn parts_and_losses_are_those_of_the_whole() {
-        let draw = |k: usize, column: usize| (Seed::root(column as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
-        let mut g = HostGaussians { sh_degree: 2, opacity_logits: vec![0.0; 300], ..Default::default() };
-        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
-            *values = (0..300 * width).map(|k| draw(k, column)).collect();
-        }
+        let g = random_gaussians(300, 2);
         let (columns, context) = (Columns::from(&g), CodecContext::new(Seed::root(1), Limits::default(), &Silent));
         let importance = importance::estimate(&g, &context);
         let classes = classify(&importance.weights, &importance.shapes, true);

@@ -35,7 +35,7 @@ impl Rounding for Rounder<'_> {
             out.means[3 * i..3 * i + 3].fill(step as f32);
             out.log_scales[3 * i..3 * i + 3].fill(geometry.scale_step_of(shape) as f32);
             let norm = gaussians.quaternions[4 * i..4 * i + 4].iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
-            let step = norm * geometry.rotation(geometry.rotation_shift(codes.scales[i], shape)).min(LARGEST_TURN);
+            let step = norm * geometry.rotation_step_of(geometry.rotation_shift(codes.scales[i], shape)).min(LARGEST_TURN);
             out.quaternions[4 * i..4 * i + 4].fill(step as f32);
             out.opacity_logits[i] = (geometry.opacity_step_of(shape) * (1.0 + f64::from(gaussians.opacity_logits[i]).max(0.0))) as f32;
         }
@@ -54,7 +54,7 @@ impl Rounding for Rounder<'_> {
         for (i, &shape) in shapes.iter().enumerate() {
             // The largest component is not stored.
             let q: [f64; 4] = std::array::from_fn(|k| f64::from(gaussians.quaternions[4 * i + k]));
-            let step = q.iter().map(|v| v * v).sum::<f64>().sqrt() * geometry.rotation(geometry.rotation_shift(codes.scales[i], shape));
+            let step = q.iter().map(|v| v * v).sum::<f64>().sqrt() * geometry.rotation_step_of(geometry.rotation_shift(codes.scales[i], shape));
             for k in (0..4).filter(|&k| k != usize::from(codes.rotations[i].form / 2)) {
                 out.quaternions[4 * i + k] = (slope(q[k] / step) / step) as f32;
             }
@@ -169,11 +169,12 @@ mod tests {
     use super::super::sensitivity::{Growth, Sensitivity};
     use super::super::{Choices, Job, Motion, importance, layers, read};
     use super::*;
+    use cc4dgs_format::conformance::uniform;
     use cc4dgs_format::{CodecContext, ExtraAttribute, Limits, Seed, Silent};
     use std::cell::Cell;
 
     fn scene(n: usize) -> HostGaussians {
-        let draw = |i: usize, k: usize| (Seed::root(5).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+        let draw = |i: usize, k: usize| uniform(Seed::root(5).index(i as u64), k);
         let mut g = HostGaussians { sh_degree: 2, opacity_logits: vec![0.0; n], ..Default::default() };
         for (column, (name, width, values)) in g.columns_mut().into_iter().enumerate() {
             let shift = if name == "log_scales" { -3.0 } else { 0.0 };

@@ -59,7 +59,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
                 Allowance::Difference { limit: libm::pow(10.0, -0.1 * settings.psnr_db), images, kind: views.kind() }
             }
         }
-        _ => Allowance::Bytes { limit: bytes_of_file(settings, context)?, context },
+        _ => Allowance::Bytes { limit: allowed_bytes(settings, context)?, context },
     };
     let tunes = settings.finetune > 0 && has_images && !matches!(allowance, Allowance::Difference { .. });
     let tuner = context.tuner.filter(|_| tunes);
@@ -144,8 +144,8 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     Ok(streams)
 }
 
-/// Whether the best attempt without corrections of the columns is better than that with them. Given are the shares of what is allowed that they use, and whether
-/// the corrections save bytes where these are not what is allowed. Of two that use too much, the better is nearer to what is allowed.
+/// Whether the best attempt without corrections of the columns is better than that with them. Given are the shares of what is allowed that they use, and
+/// whether the corrections save bytes where these are not what is allowed. Of two that use too much, the better is nearer to what is allowed.
 fn plain_is_better(plain: f64, corrected: f64, saves: bool) -> bool {
     match (plain <= 1.0, corrected <= 1.0) {
         (true, fits) => !(fits && saves),
@@ -167,8 +167,8 @@ pub fn file_bytes(context: &CodecContext, streams: &[Stream], weights: Option<(&
     Ok(context.file_bytes.map_or(Ok(bytes_of(streams) as u64), |of| of(streams, weights))? as f64)
 }
 
-/// The allowed bytes of the file, if there is room for Gaussians.
-fn bytes_of_file(settings: &Settings, context: &CodecContext) -> Result<f64> {
+/// The allowed bytes of the file; an error where header and weights alone have as many.
+fn allowed_bytes(settings: &Settings, context: &CodecContext) -> Result<f64> {
     let limit = 1e6 * settings.max_size_mb;
     let rest = context.file_bytes.map_or(Ok(0), |of| of(&[], None))? as f64;
     if rest < limit {

@@ -5,8 +5,8 @@ use super::job::{Attempt, Job};
 use super::search::file_bytes;
 use cc4dgs_format::{CodecContext, Error, Result, Stream};
 
-/// Attempts of a search, at most; and as many more where it has found no file that is small enough, which is where an octave of the steps saves fewer bytes than
-/// expected.
+/// Attempts of a search, at most; and as many more where it has found no file that is small enough, which is where an octave of the steps saves fewer bytes
+/// than expected.
 const ATTEMPTS: usize = 8;
 /// Parameters of a Gaussian that are not rounded to zero, for the estimate of the error.
 pub const PARAMETERS: f64 = 20.0;

@@ -3,7 +3,7 @@
 use super::columns::Columns;
 use super::encode::Classes;
 use super::images::Images;
-use super::importance::{budget, median};
+use super::importance::{budget, median, middle_log_scale};
 use cc4dgs_format::{CodecContext, ExtraAttribute, Result};
 use std::ops::RangeInclusive;
 
@@ -68,7 +68,7 @@ pub fn measure(gaussians: Columns, classes: &Classes, context: &CodecContext, qu
     let Some((views, renderer)) = services.filter(|_| !gaussians.is_empty() && !gaussians.extra.is_empty()) else { return Ok(Vec::new()) };
     let gaussians = gaussians.to_host();
     let images = Images::of(&gaussians, views, renderer, views.len().min(budget(WORK, gaussians.len(), VIEWS)))?;
-    let middles: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
+    let middles: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(middle_log_scale).collect();
     let mut out = Vec::new();
     for (name, attribute) in gaussians.extra.iter().filter(|(_, attribute)| attribute.width > 0) {
         let rows = needed(attribute, gaussians.len());

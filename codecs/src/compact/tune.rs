@@ -1,7 +1,7 @@
 //! Fine-tuning: rounds of training with rounded values, each in the steps that those before suggest.
 //!
-//! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The best
-//! file that keeps what is allowed is taken; if there is none, the one that needed no training.
+//! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The
+//! best file that keeps what is allowed is taken; if there is none, the one that needed no training.
 
 use super::bytes_of;
 use super::columns::Columns;
@@ -21,8 +21,8 @@ const FURTHER: usize = 2;
 const FIRST: f64 = 2.0;
 /// Octaves by which the steps of two rounds differ, at most.
 const FARTHEST: f64 = 1.0;
-/// Standard deviations by which a round may lose more than expected: of all but the last, of the last if fine-tuning has a file that keeps what is allowed, and if it
-/// has none.
+/// Standard deviations by which a round may lose more than expected: of all but the last, of the last if fine-tuning has a file that keeps what is allowed, and
+/// if it has none.
 const CAUTION: [f64; 3] = [0.5, 0.5, 1.0];
 /// The share of an allowed size that rounds aim at, and that of an allowed loss that those which follow the planned ones do.
 const SIZE_AIM: f64 = 0.99;
@@ -237,9 +237,9 @@ fn saved_weights(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64, byt
     Ok((bytes as f64 - weight_bytes(tuner, weights, 2.0 * steps)? as f64).max(0.0))
 }
 
-/// By how many octaves the steps of the weights should grow more than those of the Gaussians, so that a byte more of either is worth the same. Losses grow with squared
-/// steps, so the losses of the two are then in proportion to the bytes that doubled steps of each save. Given are the PSNR of the model, what it loses where all is
-/// rounded, and the bytes that doubled steps of the Gaussians and of the weights save.
+/// By how many octaves the steps of the weights should grow more than those of the Gaussians, so that a byte more of either is worth the same. Losses grow with
+/// squared steps, so the losses of the two are then in proportion to the bytes that doubled steps of each save. Given are the PSNR of the model, what it loses
+/// where all is rounded, and the bytes that doubled steps of the Gaussians and of the weights save.
 fn weight_octaves(tuner: &dyn TuneModel, model: &TunedModel, (psnr, untuned): (f64, f64), (per_octave, saved): (f64, f64)) -> Result<f64> {
     if saved == 0.0 {
         return Ok(0.0);

@@ -1,7 +1,8 @@
 //! The weight codec `compact`: integers of few bits with a step per array, entropy coded.
 //!
-//! Where it is known how much images depend on each weight, rows of 16 weights have steps of their own: that of their array times a power of two. A file of a given size has the
-//! smallest error where errors of all weights cost the same, that is, where steps are inversely proportional to the root of a weight's importance.
+//! Where it is known how much images depend on each weight, rows of 16 weights have steps of their own: that of their array times a power of two. A file of a
+//! given size has the smallest error where errors of all weights cost the same, that is, where steps are inversely proportional to the root of a weight's
+//! importance.
 
 use super::entropy::{Coder, Decoder, Encoder, LANES, Lanes, Tables, symbol_of, symmetric};
 use cc4dgs_format::archive::ByteReader;
@@ -143,7 +144,8 @@ impl Coder for Uncoded {
     }
 }
 
-/// Derivatives of the estimated bits of a row by its values, in steps: for distributions that fall by the factor ρ from one magnitude to the next, each is -log2 ρ.
+/// Derivatives of the estimated bits of a row by its values, in steps: for distributions that fall by the factor ρ from one magnitude to the next, each is
+/// -log2 ρ.
 fn bit_slopes(row: &[f32], step: f64) -> impl Iterator<Item = f32> {
     let mean = (row.iter().map(|v| f64::from(v.abs())).sum::<f64>() / (row.len().max(1) as f64 * step)).max(LEAST_MAGNITUDE);
     let slope = -libm::log2(((1.0 + mean * mean).sqrt() - 1.0) / mean);
@@ -244,7 +246,7 @@ impl Default for Settings {
     }
 }
 
-/// Keeps the plug-in in the program; see [`crate::link`].
+/// Builds the codec. [`crate::link`] refers to it too.
 pub(crate) fn build(settings: &toml::Table) -> Result<Box<dyn WeightCodec>> {
     let Settings { bits, array_bits } = config::parse_section("weight-codec compact", settings)?;
     if let Some(odd) = array_bits.iter().chain([&bits]).find(|bits| !RANGE.contains(bits)) {

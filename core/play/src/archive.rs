@@ -7,7 +7,7 @@ use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, OrbitViews, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, PackedStreams, StreamKind};
 use cc4dgs_core::format::check_linked;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
@@ -21,6 +21,7 @@ use std::borrow::Cow;
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
 const ATTRIBUTES: &str = "attributes";
@@ -200,9 +201,15 @@ impl Model {
             extra,
             ..Default::default()
         };
+        // Where a size is bounded, the codec measures many files with the same weights, and the last of them is often the one that is written.
+        let packed = codec.most_bytes().map(|_| Arc::new(PackedStreams::default()));
         let writer = |found: &Option<EncodedWeights>| {
             let deformer = weights.as_ref().zip(found.as_ref()).map(|(w, (_, settings))| w.entry(settings.clone()));
-            ArchiveWriter::new(Manifest { deformer, ..manifest.clone() })
+            let writer = ArchiveWriter::new(Manifest { deformer, ..manifest.clone() });
+            match &packed {
+                Some(packed) => writer.reusing(packed),
+                None => writer,
+            }
         };
         // Streams in the order in which a player needs them.
         let assembled = |mut streams: Vec<Stream>, found: &Option<EncodedWeights>| {

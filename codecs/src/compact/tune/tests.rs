@@ -5,7 +5,7 @@ use super::super::encode::classify;
 use super::super::job::{CODED, QUANTISED};
 use super::super::joint::Directions;
 use super::super::search::{estimate, search};
-use super::super::{Choices, Motion, importance, layers};
+use super::super::{Choices, Motion, importance, layers, random_gaussians};
 use super::*;
 use cc4dgs_format::{Camera, EncodedWeights, Image8, Recorder, RenderModel, RenderedPlanes, Seed, TrainingViews};
 use std::cell::{Cell, RefCell};
@@ -79,11 +79,7 @@ impl TuneModel for Trainer {
 /// Calls `run` with a job of random Gaussians, the directions from which they are seen, and a context that notes events.
 fn with_job(sh_degree: usize, run: impl for<'a> FnOnce(&mut Job<'a>, &'a Directions, &CodecContext, &Recorder)) {
     let n = 500;
-    let draw = |k: usize, column: u64| (Seed::root(column).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
-    let mut g = HostGaussians { sh_degree, opacity_logits: vec![0.0; n], ..Default::default() };
-    for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
-        *values = (0..n * width).map(|k| draw(k, column as u64)).collect();
-    }
+    let mut g = random_gaussians(n, sh_degree);
     g.dynamic_scores = (0..n).map(|row| row as f32).collect();
     let events = Recorder::default();
     let context = CodecContext::new(Seed::root(1), Default::default(), &events);

@@ -27,7 +27,7 @@ pub(crate) mod zstandard;
 
 pub use bytes::ByteReader;
 pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, MOST_FRAMES, Manifest, Provenance, RasterizerEntry};
-pub use packing::estimate_stored_len;
+pub use packing::{PackedStreams, estimate_stored_len};
 pub use presentation::{MAX_CAMERAS, Presentation};
 pub use read::{Archive, StreamInfo};
 pub use write::{ArchiveWriter, write_atomically};

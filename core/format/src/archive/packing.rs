@@ -1,8 +1,12 @@
 //! Compression of a stream: byte planes and Zstandard.
 
+use super::StreamKind;
 use super::zstandard::{compress, decompress};
-use crate::{Error, Limits, Result};
+use crate::{Error, Limits, Result, Stream};
 use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use xxhash_rust::xxh3::xxh3_128;
 
 /// The shuffle width is chosen on this many leading bytes of a stream, which bounds the time for long streams.
 const TRIAL_BYTES: usize = 1 << 20;
@@ -39,8 +43,37 @@ pub(super) struct Packed {
     pub(super) bytes: Vec<u8>,
 }
 
+/// The streams of the archive that was made last, as they are stored, for an archive that has some of them too
+/// ([`ArchiveWriter::reusing`](super::ArchiveWriter::reusing)): these are not compressed again. They are kept in memory.
+#[derive(Default)]
+pub struct PackedStreams {
+    /// By a hash of the bytes before compression.
+    last: Mutex<BTreeMap<u128, Arc<Packed>>>,
+}
+
+impl PackedStreams {
+    /// Packs `streams`, in their order, and keeps the results instead of those of the archive before.
+    pub(super) fn pack_all(&self, streams: &[(StreamKind, Stream)]) -> Result<Vec<Arc<Packed>>> {
+        let known = std::mem::take(&mut *self.last());
+        let keyed = |(_, stream): &(StreamKind, Stream)| -> Result<(u128, Arc<Packed>)> {
+            let key = xxh3_128(&stream.bytes);
+            let packed = match known.get(&key) {
+                Some(packed) => Arc::clone(packed),
+                None => Arc::new(pack(&stream.bytes)?),
+            };
+            Ok((key, packed))
+        };
+        let packed = streams.par_iter().map(keyed).collect::<Result<Vec<_>>>()?;
+        self.last().extend(packed.iter().map(|(key, packed)| (*key, Arc::clone(packed))));
+        Ok(packed.into_iter().map(|(_, packed)| packed).collect())
+    }
+    fn last(&self) -> MutexGuard<'_, BTreeMap<u128, Arc<Packed>>> {
+        self.last.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
 /// Packs `bytes` in the smallest form.
-pub(super) fn pack(bytes: &[u8]) -> Result<Packed> {
+fn pack(bytes: &[u8]) -> Result<Packed> {
     let (shuffle, trial) = best_shuffle(bytes)?;
     let compressed = if bytes.len() <= TRIAL_BYTES { trial } else { compress(&shuffled(bytes, shuffle))? };
     if compressed.len() < bytes.len() {
@@ -138,6 +171,23 @@ mod tests {
         let floats: Vec<u8> = (0..400_000).flat_map(|i| (1.0f32 + i as f32 * 1e-6).to_le_bytes()).collect();
         let packed = round_trip(&floats);
         assert_eq!(packed.shuffle, 4, "slowly varying floats compress better in byte planes");
+    }
+
+    #[test]
+    fn what_the_archive_before_has_is_not_compressed_again() {
+        let stream = |name: &str, text: &str| (StreamKind::Field, Stream { name: name.into(), bytes: text.repeat(50).into_bytes() });
+        let (weights, first, second) = (stream("weights", "the same "), stream("means", "first "), stream("means", "second "));
+        let reused = PackedStreams::default();
+        let before = reused.pack_all(&[weights.clone(), first.clone()]).unwrap();
+        let after = reused.pack_all(&[second.clone(), weights.clone()]).unwrap();
+        assert!(Arc::ptr_eq(&before[0], &after[1]), "the weights were compressed twice");
+        for ((_, stream), found) in [&second, &weights].into_iter().zip(&after) {
+            let alone = pack(&stream.bytes).unwrap();
+            assert!(found.bytes == alone.bytes && (found.shuffle, found.encoding) == (alone.shuffle, alone.encoding), "{}", stream.name);
+        }
+        // Streams of earlier archives are not kept.
+        let again = reused.pack_all(&[first]).unwrap();
+        assert!(!Arc::ptr_eq(&before[1], &again[0]) && before[1].bytes == again[0].bytes);
     }
 
     #[test]

@@ -1,23 +1,28 @@
 //! Writing of an archive, deterministically and atomically.
 
-use super::packing::pack;
+use super::packing::PackedStreams;
 use super::zstandard::compress;
 use super::{FORMAT_VERSION, LARGEST_HEADER, MAGIC, MOST_STREAMS, Manifest, StreamKind};
 use crate::{Error, Limits, Result, Stream};
-use rayon::prelude::*;
 use std::path::Path;
+use std::sync::Arc;
 use xxhash_rust::xxh3::xxh3_64;
 
 /// Collects a manifest and streams and writes them as one archive. Equal inputs give equal bytes.
 pub struct ArchiveWriter {
     manifest: Manifest,
     streams: Vec<(StreamKind, Stream)>,
+    packed: Option<Arc<PackedStreams>>,
 }
 
 impl ArchiveWriter {
     /// An archive without streams; the manifest's format version is set to this build's.
     pub fn new(manifest: Manifest) -> Self {
-        Self { manifest: Manifest { format_version: FORMAT_VERSION, ..manifest }, streams: Vec::new() }
+        Self { manifest: Manifest { format_version: FORMAT_VERSION, ..manifest }, streams: Vec::new(), packed: None }
+    }
+    /// Takes streams that another archive with the same `packed` had last as they were compressed there. The bytes of the archive do not depend on it.
+    pub fn reusing(self, packed: &Arc<PackedStreams>) -> Self {
+        Self { packed: Some(Arc::clone(packed)), ..self }
     }
     /// Adds a stream. Names must be unique in the archive and 1 to 255 bytes long; [`ArchiveWriter::to_bytes`] checks them.
     pub fn add(mut self, kind: StreamKind, stream: Stream) -> Self {
@@ -44,7 +49,10 @@ impl ArchiveWriter {
             return Err(Error::limit("streams of an archive", names.len() as u64, u64::from(MOST_STREAMS), "Store several columns in one stream"));
         }
         self.check_manifest()?;
-        let packed = self.streams.par_iter().map(|(_, s)| pack(&s.bytes)).collect::<Result<Vec<_>>>()?;
+        let packed = match &self.packed {
+            Some(packed) => packed.pack_all(&self.streams)?,
+            None => PackedStreams::default().pack_all(&self.streams)?,
+        };
         let manifest = self.manifest.to_json()?;
         let mut plain = Vec::with_capacity(manifest.len() + 64 * packed.len());
         plain.extend((manifest.len() as u32).to_le_bytes());
@@ -68,7 +76,7 @@ impl ArchiveWriter {
         out.extend(xxh3_64(&header).to_le_bytes());
         out.extend(header);
         for packed in packed {
-            out.extend(packed.bytes);
+            out.extend(&packed.bytes);
         }
         Ok(out)
     }
@@ -189,6 +197,19 @@ mod tests {
         write_atomically(&pipe, b"through").unwrap();
         assert_eq!(reader.join().unwrap(), b"through");
         assert!(!pipe.metadata().unwrap().is_file());
+    }
+
+    #[test]
+    fn archives_that_reuse_packed_streams_have_the_same_bytes() {
+        let reused = Arc::new(PackedStreams::default());
+        for text in ["first ", "second ", "second "] {
+            let archive = || {
+                let stream = |name: &str, text: &str| Stream { name: name.into(), bytes: text.repeat(50).into_bytes() };
+                let writer = ArchiveWriter::new(Manifest { frame_count: 1, ..Default::default() });
+                writer.add(StreamKind::Canonical, stream("means", text)).add(StreamKind::Field, stream("weights", "the same "))
+            };
+            assert_eq!(archive().reusing(&reused).to_bytes().unwrap(), archive().to_bytes().unwrap(), "{text}");
+        }
     }
 
     #[test]
