@@ -18,7 +18,8 @@ impl Exporter for PlySequence {
         let blur = facts.lost_blur().map_or_else(String::new, |blur| format!(", {blur}"));
         let (applies, part) = still::highest_degree(facts);
         let degree = if applies { format!(", {part}") } else { String::new() };
-        format!("It holds {frames} frames and nothing between them, without times, background{blur}{degree} and dynamic scores.")
+        let held = if frames == 1 { "1 frame".to_string() } else { format!("{frames} frames and nothing between them") };
+        format!("It holds {held}, without times, background{blur}{degree} and dynamic scores.")
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let facts = source.facts().clone();

@@ -160,7 +160,7 @@ codec = 'raw'
     let found = results(&sweep);
     assert!(found.len() == 1 && found[0].1["axes"]["codec"] == "raw", "{found:?}");
     let said = fail(&["sweep", "collect", text(&sweep), "-q"], 3);
-    assert!(said.contains("1 of 2 cells are missing") && said.contains("impossible") && said.contains("codec compact"), "{said}");
+    assert!(said.contains("1 of 2 cells is missing") && said.contains("impossible") && said.contains("codec compact"), "{said}");
 }
 
 #[test]

@@ -41,8 +41,8 @@ pub use cc4dgs_format::{
     Event, EventSink, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, FIELD_STREAMS, Fanout, FileBytes,
     GaussianFile, HostGaussians, Image8, Limits, MOVING, Moving, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rounding,
     Rules, Seed, Silent, Similarity, StoredModel, Stream, StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec,
-    WeightCodecPlugin, WeightSteps, archive, blur_at, by_likeness, canonical_stages, config, exporter, glam, inventory, playback, plugin_kind, ply, psnr_of,
-    psnr_on_views, read_gaussians, read_stage, read_weights, serde, split_kind, spz, storage, toml, unknown_name, weight_seed,
+    WeightCodecPlugin, WeightSteps, archive, blur_at, by_likeness, canonical_stages, config, exporter, glam, inventory, playback, plugin_kind, plural, ply,
+    psnr_of, psnr_on_views, read_gaussians, read_stage, read_weights, serde, split_kind, spz, storage, toml, unknown_name, weight_seed,
 };
 pub use deformer::{
     AttributeSpec, BuildLayer, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures,

@@ -64,7 +64,8 @@ pub trait LossTerm: Send {
     /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training. Add many numbers
     /// with [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
-    /// Whether the term compares recorded depth, [`LossInput::depth`]. It is read for terms that do, and a scene without it is refused then.
+    /// Whether the term compares recorded depth, [`LossInput::depth`]. It is read for terms that do. Training refuses a scene without it.
+    /// Fine-tuning and re-fit leave the term out with a warning, and refuse the scene where the loss has no other terms.
     fn wants_depth(&self) -> bool {
         false
     }

@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use cc4dgs_core::archive::{CodecEntry, DeformerEntry};
 use cc4dgs_core::{
     CodecContext, DeformerContext, EncodedWeights, Error, Event, EventSink, FIELD_STREAMS, Limits, Plugin, Registry, Result, Scene, Stream, TrainingViews,
-    WeightArray, config, psnr_on_views, split_kind, weight_seed,
+    WeightArray, config, plural, psnr_on_views, split_kind, weight_seed,
 };
 use std::ops::RangeInclusive;
 
@@ -122,7 +122,8 @@ impl FieldWeights {
         let (bits, found) = search_bits(&object, &counts, range, limit, &mut attempt)?;
         let text: Vec<String> = bits.iter().map(f64::to_string).collect();
         let (bits, number, kind) = (text.join(", "), judges.len().min(VIEWS), judges.kind());
-        let message = format!("{bits} bits, PSNR {:.4} dB lower on {number} {kind} views ({limit} dB allowed)", found.drop);
+        let views = plural(number, "view", "views");
+        let message = format!("{bits} bits, PSNR {:.4} dB lower on {number} {kind} {views} ({limit} dB allowed)", found.drop);
         context.events.emit(&Event::Note { object, message });
         Ok((found.streams, found.settings))
     }

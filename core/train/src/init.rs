@@ -4,7 +4,7 @@ use crate::config::{InitSource, RunConfig};
 use crate::data::init::{find_points, limit_opacities, limit_sizes};
 use crate::knn::mean_squared_distance_3nn;
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, Event, EventSink, HostGaussians, PointCloud, Result, Scene, Seed};
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, PointCloud, Result, Scene, Seed, plural};
 use rand::seq::SliceRandom;
 
 /// The degree-0 basis function of spherical harmonics.
@@ -21,7 +21,8 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
     let most = config.density.get("max_gaussians").and_then(toml::Value::as_integer).filter(|most| *most > 0).map_or(usize::MAX, |most| most as usize);
     let count = config.init.count.min(most).min(config.limits.max_gaussians as usize);
     if most < config.init.count {
-        let message = format!("init.count is {}, over density.max_gaussians: the run begins with {most} Gaussians at most", config.init.count);
+        let noun = plural(most, "Gaussian", "Gaussians");
+        let message = format!("init.count is {}, over density.max_gaussians: the run begins with {most} {noun} at most", config.init.count);
         events.emit(&Event::Note { object: "initial Gaussians".into(), message });
     }
     let own = scene.points.as_ref().filter(|p| !p.positions.is_empty());
@@ -30,7 +31,9 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
     let (points, mut message) = match (config.init.source, own) {
         (InitSource::Auto, Some(points)) if few => {
             let found = find_points(scene, InitSource::Auto, count - points.positions.len(), seed)?;
-            let message = format!("{} points of the dataset are few for {count} Gaussians; beside them {}", points.positions.len(), found.describe());
+            let own = points.positions.len();
+            let [noun, are, them] = [plural(own, "point", "points"), plural(own, "is", "are"), plural(own, "it", "them")];
+            let message = format!("{own} {noun} of the dataset {are} few for {count} Gaussians; beside {them} {}", found.describe());
             let mut all = points.clone();
             all.positions.extend(found.cloud.positions);
             all.colors.extend(found.cloud.colors);
@@ -39,7 +42,7 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
         }
         (InitSource::Auto | InitSource::Points, Some(points)) => {
             let points = thin(points.clone(), count, seed.child("thin"));
-            let message = format!("{} points of the dataset", points.positions.len());
+            let message = format!("{} {} of the dataset", points.positions.len(), plural(points.positions.len(), "point", "points"));
             (points, message)
         }
         (InitSource::Points, None) => {

@@ -3,8 +3,10 @@
 use burn::tensor::{Device, Int, Tensor};
 use cc4dgs::Session;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, Gaussians, HostGaussians, LossInput, Registry, Schedule, Split, Stage, View, toml};
-use std::sync::Arc;
+use cc4dgs_core::{Camera, Event, Gaussians, HostGaussians, LossInput, Registry, Schedule, Split, Stage, View, toml};
+use cc4dgs_train::train::{RefitJob, prune_and_refit};
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
 
 /// The value of the term with `settings` for three pixels, the third of unknown depth, and its gradients by alpha and depth.
 fn of_three_pixels(settings: &str, schedule: &Schedule) -> (f32, Vec<f32>) {
@@ -95,6 +97,43 @@ fn a_scene_without_depth_is_refused() {
     let message = train(1.0).unwrap_err();
     assert!(message.starts_with("loss depth: ") && message.contains("depth_file_path"), "{message}");
     assert_eq!(train(0.0), Ok(()), "a term without weight wants nothing");
+}
+
+#[test]
+fn further_training_leaves_out_depth_that_is_missing_unless_nothing_else_is_left() {
+    let folder = tempfile::tempdir().unwrap();
+    crate::readers::common::write_nerfstudio(folder.path(), 4);
+    let warnings = Arc::new(Mutex::new(Vec::new()));
+    let told = warnings.clone();
+    let listener = move |event: &Event| {
+        if let Event::Warning { object, message } = event {
+            told.lock().unwrap().push(format!("{object}: {message}"));
+        }
+    };
+    let session = Session::builder().device("flex").on_event(listener).build().unwrap();
+    let sets = sets(0.0, 4);
+    let config = session.config("demo", &sets.iter().map(String::as_str).collect::<Vec<_>>()).unwrap();
+    let scene = Arc::new(session.read_scene(folder.path(), &config.scene).unwrap());
+    let mut model = session.train(&config, scene.clone(), None).unwrap();
+    let (finetune, never): (toml::Table, AtomicBool) = ("finetune = 2".parse().unwrap(), AtomicBool::new(false));
+    // Of fine-tuning and of re-fit what came of it, and the warnings of depth together, where the model was trained with `loss`.
+    let mut further = |loss: &str| {
+        let trained: toml::Table = format!("loss = [{loss}]").parse().unwrap();
+        model.provenance.config.insert("loss".into(), trained["loss"].clone());
+        warnings.lock().unwrap().clear();
+        let tuned = model.save_tuned(folder.path().join("model.cc4d"), "compact:max-drop=0.5dB", &finetune, "fp32", &scene).map(drop);
+        let (registry, device, limits, events) = (session.registry(), session.device(), session.limits(), session.events());
+        let refitted = prune_and_refit(&mut model, &scene, 0.2, 2, &RefitJob { registry, device, limits, events, stop: &never }).map(drop);
+        let warned = warnings.lock().unwrap().iter().filter(|line| line.starts_with("loss depth: ")).count();
+        ([tuned, refitted].map(|done| done.map_err(|e| e.to_string())), warned)
+    };
+    let (alone, warned) = further("{kind='depth', weight=0.2}");
+    for done in alone {
+        let message = done.unwrap_err();
+        assert!(message.starts_with("loss depth: ") && message.contains("finetune=0") && message.contains("--refit 0"), "{message}");
+    }
+    assert_eq!(warned, 0);
+    assert_eq!(further("{kind='l1', weight=0.8}, {kind='depth', weight=0.2}"), ([Ok(()), Ok(())], 2), "each warns once");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! `mp4`: rendered images as a video, through the `ffmpeg` command.
 
 use crate::video::{VideoWriter, ffmpeg_version};
-use cc4dgs_core::{Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, Plugin, Result, config, inventory, toml};
+use cc4dgs_core::{Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, Plugin, Result, config, inventory, plural, toml};
 use std::path::Path;
 
 const SCHEMA: &str = "\
@@ -14,7 +14,8 @@ struct Mp4 {
 
 impl Exporter for Mp4 {
     fn loses(&self, facts: &ExportFacts) -> String {
-        format!("It holds {} images at {} per second and no Gaussians.", facts.images, facts.frames_per_second)
+        let images = plural(facts.images, "image", "images");
+        format!("It holds {} {images} at {} per second and no Gaussians.", facts.images, facts.frames_per_second)
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         ffmpeg_version()?;

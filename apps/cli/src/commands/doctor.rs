@@ -6,7 +6,9 @@ use cc4dgs::exporters::web::{Page, page_paths};
 use cc4dgs::video;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::metrics::{WeightsId, installed_lpips, lpips_paths};
-use cc4dgs_core::{Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, adapters, auto_device, parse_device};
+use cc4dgs_core::{
+    Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, adapters, auto_device, parse_device, plural,
+};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -132,7 +134,7 @@ pub fn run(context: &Context) -> Result<()> {
 
 fn text(r: &Report) -> String {
     let mut lines = vec![
-        format!("cc4dgs {} on {} {}, {} threads", r.version, r.os, r.architecture, r.threads),
+        format!("cc4dgs {} on {} {}, {} {}", r.version, r.os, r.architecture, r.threads, plural(r.threads, "thread", "threads")),
         format!("processor: {}", if r.cpu_features.is_empty() { "no vector extension known here".to_string() } else { r.cpu_features.join(" ") }),
     ];
     lines.extend(r.devices.iter().map(|d| format!("device {:<8} {:<4} {}", d.name, if d.available { "yes" } else { "no" }, d.note)));

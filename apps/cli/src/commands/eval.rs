@@ -7,7 +7,7 @@ use crate::models::{Loaded, load_model};
 use cc4dgs::scenes::{open_as_trained, options_as_trained};
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::sample::spread_views;
-use cc4dgs_core::{Error, Event, EventSink, Limits, Result, Scene, Split};
+use cc4dgs_core::{Error, Event, EventSink, Limits, Result, Scene, Split, plural};
 use cc4dgs_train::data::procedural::{ProceduralScene, whole_scene};
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
 use cc4dgs_train::images::{Comparison, SheetOptions, comparison_sheet, write_png};
@@ -227,7 +227,7 @@ pub fn text(report: &FullReport) -> String {
     let e = &report.eval;
     let ms_ssim = e.ms_ssim.map_or_else(|| "too small".to_string(), |v| format!("{v:.4}"));
     let mut lines = vec![
-        format!("{} on {} ({} images)", report.model.display(), e.scene, e.images.len()),
+        format!("{} on {} ({} {})", report.model.display(), e.scene, e.images.len(), plural(e.images.len(), "image", "images")),
         format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
         e.flip.map_or_else(String::new, |flip| match &e.lpips_absent {
             None => format!("  LPIPS {} (AlexNet)   FLIP {flip:.4}", e.lpips.map_or_else(|| "-".to_string(), |v| format!("{v:.4}"))),

@@ -6,7 +6,7 @@ use crate::ignored::{Stated, refuse_ignored, written};
 use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::export::{ExportJob, ExportRequest, check_time};
-use cc4dgs_core::{Error, ExportTarget, ExporterPlugin, Registry, Result, config};
+use cc4dgs_core::{Error, ExportTarget, ExporterPlugin, Registry, Result, config, plural};
 use cc4dgs_play::source::{Source, SourceKind};
 use std::path::Path;
 
@@ -67,8 +67,8 @@ pub fn finish(context: &Context, job: &ExportJob) -> Result<()> {
     let report = job.run()?;
     context.output.result(&report, || {
         let what = match (report.gaussians, report.frames) {
-            (0, frames) => format!("{frames} frames"),
-            (gaussians, 0 | 1) => format!("{gaussians} Gaussians"),
+            (0, frames) => format!("{frames} {}", plural(frames, "frame", "frames")),
+            (gaussians, 0 | 1) => format!("{gaussians} {}", plural(gaussians, "Gaussian", "Gaussians")),
             (gaussians, frames) => format!("{gaussians} Gaussians, {frames} instants"),
         };
         let first = format!("{}: {what}, {:.3} MB", report.file.display(), report.size_mb);

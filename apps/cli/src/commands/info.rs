@@ -6,7 +6,7 @@ use super::{Context, megabytes};
 use crate::args::Info;
 use cc4dgs_core::archive::{Archive, DeformerEntry, StreamKind};
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, HostGaussians, Result, Scene, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_core::{Error, HostGaussians, Result, Scene, SceneOptions, Silent, Split, parse_device, plural};
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_play::{Model, attribute_width};
 use cc4dgs_train::data;
@@ -195,7 +195,8 @@ fn camera_lines(cameras: &Value) -> Vec<String> {
     };
     let mut lines: Vec<String> = all.iter().take(MOST_CAMERAS).map(line).collect();
     if all.len() > MOST_CAMERAS {
-        lines.push(format!("and {} more cameras, which --json lists", all.len() - MOST_CAMERAS));
+        let more = all.len() - MOST_CAMERAS;
+        lines.push(format!("and {more} more {}, which --json lists", plural(more, "camera", "cameras")));
     }
     lines
 }

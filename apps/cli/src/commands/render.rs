@@ -7,7 +7,7 @@ use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::video::{self, VideoWriter};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
+use cc4dgs_core::{Camera, Error, Event, EventSink, Result, plural};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::images::write_png;
 use serde::Serialize;
@@ -79,8 +79,9 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     context.output.result(&report, || {
         let video = args.mp4.as_ref().map_or_else(String::new, |p| format!(" and {}", p.display()));
         format!(
-            "{} frames in {}{video}; deformer {:.2} + rasterizer {:.2} ms per frame",
+            "{} {} in {}{video}; deformer {:.2} + rasterizer {:.2} ms per frame",
             report.frames,
+            plural(report.frames, "frame", "frames"),
             args.out.display(),
             report.frame_ms.field,
             report.frame_ms.raster

@@ -3,7 +3,7 @@
 use super::{Context, megabytes};
 use crate::args::{ImagesArg, Report};
 use crate::ignored::{Stated, refuse_ignored};
-use cc4dgs_core::Result;
+use cc4dgs_core::{Result, plural};
 use cc4dgs_train::report::{ImageChoice, ReportOptions, write_report};
 
 /// Views per scene that images are shown of, where it is not said.
@@ -33,6 +33,7 @@ pub fn run(context: &Context, args: &Report) -> Result<()> {
     context.output.result(&files, || {
         let tables = [&files.csv, &files.markdown, &files.latex].map(|file| file.display().to_string()).join(", ");
         let gap = files.gap.as_ref().map_or_else(String::new, |gap| format!("\n{gap}"));
-        format!("{} ({:.2} MB) from {} results; tables: {tables}{gap}", files.html.display(), megabytes(files.html_bytes as u64), files.cells)
+        let results = format!("{} {}", files.cells, plural(files.cells, "result", "results"));
+        format!("{} ({:.2} MB) from {results}; tables: {tables}{gap}", files.html.display(), megabytes(files.html_bytes as u64))
     })
 }

@@ -3,7 +3,7 @@
 use super::Context;
 use crate::args::Stress;
 use cc4dgs::stress::{NO_ORACLE, StressJob, StressReport, stress};
-use cc4dgs_core::{Error, Event, EventSink, Result, parse_device, resolved_device};
+use cc4dgs_core::{Error, Event, EventSink, Result, parse_device, plural, resolved_device};
 use serde_json::json;
 use std::collections::BTreeMap;
 
@@ -46,7 +46,8 @@ pub fn run(context: &Context, args: &Stress) -> Result<()> {
     match failures.as_slice() {
         [] => Ok(()),
         [first, ..] => {
-            let problem = format!("{} of {} cases do not behave, the first is {first}", failures.len(), report.cases.len());
+            let behave = plural(failures.len(), "does not behave, it is", "do not behave, the first is");
+            let problem = format!("{} of {} cases {behave} {first}", failures.len(), report.cases.len());
             Err(Error::backend(format!("stress on {name}"), problem, "The table has them all; report them as defects"))
         }
     }

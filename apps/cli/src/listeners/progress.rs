@@ -1,6 +1,6 @@
 //! Progress on standard error: a bar on a terminal, an occasional line elsewhere.
 
-use cc4dgs_core::{Event, EventSink};
+use cc4dgs_core::{Event, EventSink, plural};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::{IsTerminal, Write};
 use std::sync::Mutex;
@@ -97,7 +97,7 @@ fn work(counter: &str, done: u64, skipped: u64) -> String {
         "vertices decoded" => format!("{done} vertices decoded, {skipped} reused"),
         "Gaussians deformed" => format!("{done} Gaussians deformed, {skipped} static ones left alone"),
         "Gaussians updated" => format!("{done} Gaussians updated, {skipped} out of view left alone (in the iterations that are logged)"),
-        "Gaussians that move" => format!("{done} Gaussians move, {skipped} stay"),
+        "Gaussians that move" => format!("{done} {}, {skipped} {}", plural(done, "Gaussian moves", "Gaussians move"), plural(skipped, "stays", "stay")),
         "spatial passes of the deformer" => format!("{done} spatial passes of the deformer, {skipped} taken from the cache"),
         _ => format!("{counter}: {done}, skipped {skipped}"),
     }

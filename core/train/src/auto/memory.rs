@@ -1,12 +1,16 @@
-//! The memory that a plan may count on, and how much of it holds decoded images.
+//! The memory that a plan may count on, and how much of it holds decoded images and recorded depth.
 
 use super::Choice;
 use crate::config::RunConfig;
-use cc4dgs_core::SceneOptions;
+use crate::train::LossTerms;
+use cc4dgs_core::{Registry, Result, SceneOptions, plural};
 use std::path::{Path, PathBuf};
 
 /// The setting for the cache.
 const CACHE: &str = "scene.cache_mb";
+/// Bytes per pixel of a decoded image, at most (one without alpha has 3), and of its recorded depth. Masks are not in the cache of a scene.
+const IMAGE_BYTES: f64 = 4.0;
+const DEPTH_BYTES: f64 = size_of::<f32>() as f64;
 
 /// Hierarchies of control groups, version 2 and version 1: controller in `/proc/self/cgroup`, folder that the hierarchy is mounted at, file with the limit.
 const HIERARCHIES: [[&str; 3]; 2] = [["", "sys/fs/cgroup", "memory.max"], ["memory", "sys/fs/cgroup/memory", "memory.limit_in_bytes"]];
@@ -41,15 +45,26 @@ fn limit_files(root: &Path, groups: &str, [controller, mount, name]: [&str; 3]) 
     folders.map(|folder| mount.join(folder.strip_prefix("/").unwrap_or(folder)).join(name)).collect()
 }
 
-/// The cache for decoded images: all `views` of so many `pixels`, as long as a third of the memory holds them. `stated_mb` is the setting without a plan.
-pub(super) fn cache(views: usize, pixels: f64, stated_mb: u64, memory: Option<u64>) -> Option<Choice> {
-    let (needed, stated) = (views as f64 * pixels * 4.0 / 1e6, stated_mb as f64);
+/// The most views whose recorded depth a training reads: all `views` that are trained on, where a term of `loss` (`[[loss]]`) compares depth, else none.
+///
+/// # Errors
+/// What the loss terms report of their settings.
+pub(super) fn depths(views: usize, loss: &[toml::Table], registry: &Registry) -> Result<usize> {
+    Ok(if LossTerms::build(registry, loss)?.want_depth() { views } else { 0 })
+}
+
+/// The cache for all `images`, decoded, and for the recorded depth of `depths` of them, each of so many `pixels`, as long as a third of the memory holds them.
+/// `stated_mb` is the setting without a plan.
+pub(super) fn cache(images: usize, depths: usize, pixels: f64, stated_mb: u64, memory: Option<u64>) -> Option<Choice> {
+    let bytes = pixels * (images as f64 * IMAGE_BYTES + depths as f64 * DEPTH_BYTES);
+    let (needed, stated) = (bytes / 1e6, stated_mb as f64);
     let most = memory.map_or(stated, |bytes| bytes as f64 / 3e6);
     let wanted = needed.min(most).ceil().max(1.0);
+    let depth = if depths > 0 { format!(" and the depth of {depths}") } else { String::new() };
     let reason = if wanted > stated {
-        format!("{views} images are kept decoded")
+        format!("{images} {}{depth} {} kept decoded", plural(images, "image", "images"), plural(images + depths, "is", "are"))
     } else if wanted < needed.min(stated) {
-        format!("{views} decoded images would take more than a third of the memory")
+        format!("{images} decoded {}{depth} would take more than a third of the memory", plural(images, "image", "images"))
     } else {
         return None;
     };
@@ -78,8 +93,46 @@ fn cache_mb(stated_mb: u64, planned: bool, processes: usize, memory: Option<u64>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::tensor::Tensor;
+    use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, inventory};
 
     const GIB: u64 = 1 << 30;
+
+    /// A loss term that compares depth if `of_depth` says so.
+    struct Test {
+        of_depth: bool,
+    }
+
+    impl LossTerm for Test {
+        fn value(&self, _: &LossInput) -> Result<Option<Tensor<1>>> {
+            Ok(None)
+        }
+        fn wants_depth(&self) -> bool {
+            self.of_depth
+        }
+    }
+
+    fn build(settings: &toml::Table) -> Result<Box<dyn LossTerm>> {
+        Ok(Box::new(Test { of_depth: settings.get("of_depth").and_then(toml::Value::as_bool).unwrap_or(false) }))
+    }
+
+    inventory::submit! {
+        LossPlugin { info: Plugin { name: "test", version: "1", summary: "a test", paper: "", schema: "", capabilities: &[] }, build, fuses: None }
+    }
+
+    #[test]
+    fn depth_is_counted_where_a_term_compares_it() {
+        let registry = Registry::collect().unwrap();
+        let of = |loss: &str| {
+            let table: toml::Table = format!("loss = [{loss}]").parse().unwrap();
+            let loss: Vec<toml::Table> = table["loss"].as_array().unwrap().iter().map(|term| term.as_table().unwrap().clone()).collect();
+            depths(40, &loss, &registry).map_err(|e| e.to_string())
+        };
+        assert_eq!(of("{kind='test'}"), Ok(0));
+        assert_eq!(of("{kind='test'}, {kind='test', of_depth=true, weight=0.2}"), Ok(40));
+        assert_eq!(of("{kind='test'}, {kind='test', of_depth=true, weight=0.0}"), Ok(0), "a term without weight wants nothing");
+        assert!(of("{kind='tset'}").unwrap_err().contains("tset"));
+    }
 
     /// The memory of a machine with 16 GiB and these files.
     fn memory_with(files: &[(&str, &str)]) -> Option<u64> {
@@ -146,10 +199,25 @@ mod tests {
 
     #[test]
     fn images_take_a_third_of_the_memory_at_most() {
-        let cache = |views, memory| cache(views, 1e6, 2000, memory).map(|choice| choice.settings[0].1.as_integer().unwrap());
+        let cache = |views, memory| cache(views, 0, 1e6, 2000, memory).map(|choice| choice.settings[0].1.as_integer().unwrap());
         assert_eq!((cache(400, Some(24_000_000_000)), cache(1500, Some(24_000_000_000))), (None, Some(6000)));
         assert_eq!((cache(5000, Some(24_000_000_000)), cache(5000, None)), (Some(8000), None));
         // An eighth of that memory: a third of it is less than the setting states.
         assert_eq!((cache(1500, Some(3_000_000_000)), cache(100, Some(3_000_000_000))), (Some(1000), None));
+    }
+
+    #[test]
+    fn depth_is_kept_beside_the_images() {
+        let chosen = |choice: Choice| (choice.settings[0].1.as_integer().unwrap(), choice.reason);
+        let cache = |images, depths, memory| cache(images, depths, 1e6, 2000, Some(memory)).map(chosen);
+        assert_eq!((cache(400, 0, 24_000_000_000), cache(400, 100, 24_000_000_000)), (None, None), "2000 MB hold all");
+        let more = Some((3200, "400 images and the depth of 400 are kept decoded".to_string()));
+        assert_eq!(cache(400, 400, 24_000_000_000), more, "4 bytes per pixel of each");
+        let reason = "400 decoded images and the depth of 300 would take more than a third of the memory";
+        assert_eq!(cache(400, 300, 3_000_000_000), Some((1000, reason.to_string())));
+        let reason = |depths| super::cache(1, depths, 1e9, 2000, None).map(|choice| choice.reason);
+        assert_eq!([reason(0), reason(1)], [None, None], "without a known memory the setting stays");
+        let reason = |depths| super::cache(1, depths, 1e9, 2000, Some(30_000_000_000)).map(|choice| choice.reason).unwrap();
+        assert_eq!([reason(0), reason(1)], ["1 image is kept decoded", "1 image and the depth of 1 are kept decoded"]);
     }
 }

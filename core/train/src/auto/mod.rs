@@ -18,7 +18,7 @@ use crate::data;
 use crate::layers::Layers;
 use crate::train_config::LEAST_ITERATIONS;
 use calibrate::{Timing, calibrate};
-use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, Split, auto_device, config, resolved_device};
+use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, Split, auto_device, config, plural, resolved_device};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -164,12 +164,13 @@ pub fn open_shared(
         events.emit(&Event::Warning { object: scene.name.clone(), message });
     }
     step(2)?;
-    let cache = memory::cache(scene.views.len(), facts.pixels(), asked.scene.cache_mb, machine.memory);
+    let full_size = if graphics { Some(layers.at_full_size(registry, choose::dataset_like(&facts))?) } else { None };
+    let depths = memory::depths(facts.views, &full_size.as_ref().unwrap_or(layers).config()?.loss, registry)?;
+    let cache = memory::cache(scene.views.len(), depths, facts.pixels(), asked.scene.cache_mb, machine.memory);
     if let Some(choice) = cache.filter(|_| !layers.state("scene.cache_mb")) {
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
-    let full_size = if graphics { Some(layers.at_full_size(registry, choose::dataset_like(&facts))?) } else { None };
     let layers = full_size.as_ref().unwrap_or(layers);
     let kind = asked.deformer.get("kind").and_then(|k| k.as_str());
     let most = asked.density.get("max_gaussians").and_then(|most| most.as_integer()).filter(|most| *most > 0).map(|most| most as f64);
@@ -208,16 +209,15 @@ pub fn open_shared(
     // A stated `auto` becomes the device that it stands for here.
     config.device = device;
     let [width, height] = facts.size;
-    let seen = format!("{}: {} training images of {width}x{height} pixels, {} frames", facts.arrangement.describe(), facts.views, facts.frames);
+    let [images, frames] = [plural(facts.views, "image", "images"), plural(facts.frames, "frame", "frames")];
+    let seen = format!("{}: {} training {images} of {width}x{height} pixels, {} {frames}", facts.arrangement.describe(), facts.views, facts.frames);
     let noun = if matches!(facts.arrangement, Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere) { "positions" } else { "cameras" };
     let overlap = facts.overlap.iter().map(|overlap| overlap.describe(noun)).collect();
     let skips = skips::describe(&config, registry)?.into_iter().collect();
     config.auto.plan = [vec![seen], overlap, plan.lines(layers), skips].concat();
     if (config.train.iterations as f64) < SHORT {
-        config
-            .auto
-            .plan
-            .push(format!("{} iterations are few: more minutes or smaller images (--minutes, scene.width) give a better model", config.train.iterations));
+        let few = format!("{} {} few", config.train.iterations, plural(config.train.iterations, "iteration is", "iterations are"));
+        config.auto.plan.push(format!("{few}: more minutes or smaller images (--minutes, scene.width) give a better model"));
     }
     config.auto.time_left = ends.map(|ends| ends.saturating_duration_since(Instant::now()));
     Ok((config, scene))
@@ -272,7 +272,7 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
         Choice { settings: rates.to_vec(), reason: format!("what views share of the deformer takes {field:.0} ms, a view {view:.0} ms{note}") },
         Choice {
             settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
-            reason: format!("{left:.1} of {minutes} minutes at about {:.0} ms per iteration on this machine", ms(views)),
+            reason: format!("{left:.1} of {minutes} {} at about {:.0} ms per iteration on this machine", plural(minutes, "minute", "minutes"), ms(views)),
         },
     ];
     if count >= COOLED {

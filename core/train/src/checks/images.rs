@@ -2,7 +2,7 @@
 
 use super::{Finding, Subject, listed};
 use crate::sample::spread_views;
-use cc4dgs_core::{Image8, Result, Scene, Split};
+use cc4dgs_core::{Image8, Result, Scene, Split, plural};
 use rayon::prelude::*;
 
 /// The most images that are looked at.
@@ -24,10 +24,13 @@ pub(super) fn check(scene: &Scene, background: [f32; 3]) -> Result<Vec<Finding>>
     let count = sample.len();
     let remedy = "Check how the images were written (bit depth, alpha, a lens cap) and that the paths lead to the right ones";
     if flat.len() == count {
-        return Ok(vec![Finding::refuse(Subject::Images, format!("all {count} training images that were looked at are {what}"), remedy)]);
+        let looked =
+            if count == 1 { "the training image that was looked at is".to_string() } else { format!("all {count} training images that were looked at are") };
+        return Ok(vec![Finding::refuse(Subject::Images, format!("{looked} {what}"), remedy)]);
     }
     let names: Vec<String> = flat.iter().map(|&(v, _)| format!("{} at frame {}", scene.camera(v).name, scene.views[v].frame)).collect();
-    let problem = format!("{} of {count} training images that were looked at are {what}: {}", flat.len(), listed(&names));
+    let are = plural(flat.len(), "is", "are");
+    let problem = format!("{} of {count} training images that were looked at {are} {what}: {}", flat.len(), listed(&names));
     Ok(vec![Finding::doubt(Subject::Images, problem, remedy)])
 }
 

@@ -10,7 +10,7 @@ use crate::schedule::StageLengths;
 use crate::train::{Context, Score, TrainState};
 use crate::train_config::MOST_STRETCH;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
+use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage, plural};
 use cc4dgs_play::Moving;
 
 /// Where the main stage is scored, percent; but for `START`, never before its length is settled, which decides what the rules are. A run stops at `LATE` if it
@@ -89,7 +89,8 @@ impl Watch {
         if rules(context).is_none() {
             if train.checks {
                 let total = context.lengths.total();
-                note(format!("none: {total} iterations are too few to be judged, which needs at least {LEAST_ITERATIONS}"));
+                let are = plural(total, "iteration is", "iterations are");
+                note(format!("none: {total} {are} too few to be judged, which needs at least {LEAST_ITERATIONS}"));
             }
             return Ok(None);
         }

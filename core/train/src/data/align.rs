@@ -2,7 +2,7 @@
 
 use super::sync::{FEWEST, frame_offsets};
 use super::video::motion;
-use cc4dgs_core::{Error, ImageSource, Limits, RawScene, Result, SceneOptions, SyncMode};
+use cc4dgs_core::{Error, ImageSource, Limits, RawScene, Result, SceneOptions, SyncMode, plural};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -116,11 +116,9 @@ fn shift(raw: &mut RawScene, offsets: &[i64]) -> Result<()> {
         view.frame = frame.saturating_sub(low).max(0) as usize;
         (low..=high).contains(&frame)
     });
-    raw.warnings.push(format!(
-        "{} frames are common to all cameras after their offsets; {} images were dropped",
-        high.saturating_sub(low).saturating_add(1),
-        before - raw.views.len()
-    ));
+    let (common, dropped) = (high.saturating_sub(low).saturating_add(1), before - raw.views.len());
+    let [are, were] = [plural(common, "frame is", "frames are"), plural(dropped, "image was", "images were")];
+    raw.warnings.push(format!("{common} {are} common to all cameras after their offsets; {dropped} {were} dropped"));
     Ok(())
 }
 

@@ -12,6 +12,7 @@ use super::video::VideoFrames;
 use cc4dgs_core::reader::files::image_size;
 use cc4dgs_core::{
     Camera, Error, FrameSource, ImageSource, InitBox, Limits, PointCloud, RawCamera, RawPoints, RawScene, Result, Scene, SceneOptions, Similarity, Split,
+    plural,
 };
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -62,10 +63,11 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
     }
     if let Some([(w, h), (width, height)]) = smaller.first() {
         raw.warnings.push(format!(
-            "the images of {} of {} cameras are smaller than scene.width, scene.height or scene.downscale ask for and are not enlarged ({w}x{h}, where \
+            "the images of {} of {} {} are smaller than scene.width, scene.height or scene.downscale ask for and are not enlarged ({w}x{h}, where \
              {width}x{height} is asked for)",
             smaller.len(),
-            plans.len()
+            plans.len(),
+            plural(plans.len(), "camera", "cameras")
         ));
     }
     let videos = VideoFrames::new(&raw.views, &plans, options)?;
@@ -108,7 +110,8 @@ fn normalised_points(points: &RawPoints, frame: &Similarity, warnings: &mut Vec<
     }
     let left_out = points.positions.len() - cloud.positions.len();
     if left_out > 0 {
-        warnings.push(format!("{left_out} points are over {FARTHEST:e} units of the normalised frame away and were left out"));
+        let [are, were] = [plural(left_out, "point is", "points are"), plural(left_out, "was", "were")];
+        warnings.push(format!("{left_out} {are} over {FARTHEST:e} units of the normalised frame away and {were} left out"));
     }
     cloud
 }

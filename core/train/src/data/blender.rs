@@ -84,7 +84,8 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
     let paths: Vec<_> = transforms.frames.iter().map(|f| image_path(folder, &f.file_path)).collect();
     let Some(present) = paths.iter().find(|p| p.is_file()) else {
         let first = paths.first().map(|p| p.display().to_string()).unwrap_or_else(|| "any".into());
-        let problem = format!("none of its {} images exist ({first})", paths.len());
+        let problem =
+            if paths.len() == 1 { format!("its image does not exist ({first})") } else { format!("none of its {} images exist ({first})", paths.len()) };
         if split == Split::Validation {
             // Nothing depends on them, and copies of the dataset leave them out.
             scene.warnings.push(format!("{object}: {problem}; there are no validation views"));

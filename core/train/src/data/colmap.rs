@@ -8,7 +8,7 @@ use super::{colmap_binary, colmap_text};
 use cc4dgs_core::reader::files::{file_name, list, read_bytes, read_text};
 use cc4dgs_core::reader::pose::{Matrix4, from_quaternion};
 use cc4dgs_core::{
-    Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
+    Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural,
 };
 use glam::DVec3;
 use std::collections::{BTreeMap, BTreeSet};
@@ -193,7 +193,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     images.sort_by(|a, b| a.name.cmp(&b.name));
     let mut scene = RawScene { name: file_name(path), points: Some(points), ..Default::default() };
     if folder != path && folder.ends_with("0") && ["bin", "txt"].iter().any(|e| is_complete(&folder.with_file_name("1"), e)) {
-        let read = format!("there are several models; that of {object} is read, with {} images", images.len());
+        let read = format!("there are several models; that of {object} is read, with {} {}", images.len(), plural(images.len(), "image", "images"));
         scene.warnings.push(format!("{read} (to read another, give its folder as the path)"));
     }
     let image_folder = image_folder(path, &images);
@@ -255,7 +255,7 @@ fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) 
     }
     if let Some(first) = pairs.first() {
         let more = if pairs.len() > 1 { ", …" } else { "" };
-        warnings.push(format!("of {} pairs of videos of one name the second is used: {first}{more}", pairs.len()));
+        warnings.push(format!("of {} {} of videos of one name the second is used: {first}{more}", pairs.len(), plural(pairs.len(), "pair", "pairs")));
     }
     if by_stem.is_empty() {
         let stems: BTreeSet<String> = images.iter().map(|image| stem(Path::new(&image.name))).collect();
@@ -263,9 +263,11 @@ fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) 
             let unknown = list(folder, |p| is_shown(p) && stems.contains(&stem(p)))?;
             if let Some(first) = unknown.first() {
                 warnings.push(format!(
-                    "{} files in {} are not read as videos ({}): the known endings are {}",
+                    "{} {} in {} {} ({}): the known endings are {}",
                     unknown.len(),
+                    plural(unknown.len(), "file", "files"),
                     folder.display(),
+                    plural(unknown.len(), "is not read as a video", "are not read as videos"),
                     file_name(first),
                     video::ENDINGS.join(", ")
                 ));
@@ -278,15 +280,18 @@ fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) 
     if let Some(lacking) = found.iter().position(Option::is_none) {
         if available > 0 {
             let (count, name) = (found.iter().filter(|f| f.is_none()).count(), &images[lacking].name);
-            let problem = format!("{count} of {} images have no video of their name ({name})", images.len());
-            warnings.push(format!("{problem}: the {available} videos are not used, and the scene is read as one instant"));
+            let have = plural(count, "has no video of its name", "have no video of their name");
+            let problem = format!("{count} of {} images {have} ({name})", images.len());
+            let videos = plural(available, "video is", "videos are");
+            warnings.push(format!("{problem}: the {available} {videos} not used, and the scene is read as one instant"));
         }
         return Ok(Vec::new());
     }
     if !by_stem.is_empty() {
         let names = by_stem.values().take(3).map(|file| file_name(file)).collect::<Vec<_>>().join(", ");
         let more = if by_stem.len() > 3 { ", …" } else { "" };
-        warnings.push(format!("{} of {available} videos are not used, since the COLMAP model has no image of their name: {names}{more}", by_stem.len()));
+        let (count, [are, their]) = (by_stem.len(), [plural(by_stem.len(), "is", "are"), plural(by_stem.len(), "its", "their")]);
+        warnings.push(format!("{count} of {available} videos {are} not used, since the COLMAP model has no image of {their} name: {names}{more}"));
     }
     Ok(found.into_iter().flatten().collect())
 }
@@ -335,7 +340,7 @@ mod tests {
         };
         film("c0.braw");
         let (files, said) = found();
-        assert!(files.is_empty() && said.contains("are not read as videos (c0.braw)") && said.contains("m2ts"), "{files:?} {said}");
+        assert!(files.is_empty() && said.contains("is not read as a video (c0.braw)") && said.contains("m2ts"), "{files:?} {said}");
         for name in ["c0.MTS", "c0.m2ts", "c0.MP4", "c0.mov", "c0.mkv", "c0.avi", "c0.webm"] {
             film(name);
             assert_eq!(found(), (vec![name.to_string()], String::new()));
@@ -344,7 +349,7 @@ mod tests {
         film("c0.MTS");
         film("c0.mp4");
         let (files, said) = found();
-        assert!(files == ["c0.mp4"] && said.contains("of 1 pairs of videos of one name") && said.contains("c0.MTS and "), "{files:?} {said}");
+        assert!(files == ["c0.mp4"] && said.contains("of 1 pair of videos of one name") && said.contains("c0.MTS and "), "{files:?} {said}");
     }
 
     #[test]
@@ -373,7 +378,10 @@ mod tests {
         film("c2.mp4");
         for path in [dir.path(), model.as_path()] {
             let (files, said) = found(path);
-            assert!(files == both && said.contains("1 of 3 videos are not used") && said.contains("c2.mp4"), "{files:?} {said}");
+            assert!(
+                files == both && said.contains("1 of 3 videos is not used, since the COLMAP model has no image of its name") && said.contains("c2.mp4"),
+                "{files:?} {said}"
+            );
         }
     }
 }

@@ -1,13 +1,14 @@
 //! Scenes whose files list images, each with a pose and a time: the images of a camera that stands still are frames of one camera.
 
-use cc4dgs_core::RawScene;
+use cc4dgs_core::{RawScene, plural};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Says so where some images state a time and others none: these count as images of time 0.
 pub(super) fn warn_of_missing_times(times: &[Option<f64>], warnings: &mut Vec<String>) {
     let missing = times.iter().filter(|time| time.is_none()).count();
     if (1..times.len()).contains(&missing) {
-        warnings.push(format!("{missing} of {} images state no time and are taken as images of time 0", times.len()));
+        let taken = plural(missing, "states no time and is taken as an image", "state no time and are taken as images");
+        warnings.push(format!("{missing} of {} images {taken} of time 0", times.len()));
     }
 }
 
@@ -28,10 +29,13 @@ pub(super) fn merge_fixed_cameras(scene: &mut RawScene, times: &[Option<f64>], b
     let repeated = times.len() - untimed - groups.values().map(|of| instants(of)).sum::<usize>();
     if untimed + repeated > 0 {
         scene.warnings.push(format!(
-            "{} images have {} poses, but {untimed} of them state no time and {repeated} the same time as another image of their pose: each image is taken for \
-             a camera of its own (state a different \"time\" for each image of one camera)",
+            "{} images have {} {}, but {untimed} of them {} no time and {repeated} the same time as another image of {} pose: each image is taken for a camera \
+             of its own (state a different \"time\" for each image of one camera)",
             times.len(),
-            groups.len()
+            groups.len(),
+            plural(groups.len(), "pose", "poses"),
+            plural(untimed, "states", "state"),
+            plural(repeated, "its", "their")
         ));
         return false;
     }
@@ -56,7 +60,7 @@ mod tests {
             warn_of_missing_times(times, &mut warnings);
             warnings.join("")
         };
-        assert!(told(&[Some(0.0), None, Some(1.0)]).starts_with("1 of 3 images state no time"));
+        assert!(told(&[Some(0.0), None, Some(1.0)]).starts_with("1 of 3 images states no time and is taken as an image of time 0"));
         assert_eq!(told(&[None, None]) + &told(&[Some(0.5)]) + &told(&[]), "");
     }
 }

@@ -1,6 +1,6 @@
 //! Frames of cameras whose clocks differ a little: the images that a rig takes together are one frame, although each states a time of its own.
 
-use cc4dgs_core::RawView;
+use cc4dgs_core::{RawView, plural};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Share of the time from one image of a camera to its next within which the images of several cameras show one instant.
@@ -46,11 +46,12 @@ pub(super) fn join_instants(views: &mut [RawView], warnings: &mut Vec<String>) {
     }
     views.iter_mut().zip(frames).for_each(|(view, frame)| view.frame = frame);
     warnings.push(format!(
-        "the cameras take their images together, at times that differ by up to {:.1} % of the time from one image to the next: {} images are {} frames, each image \
+        "the cameras take their images together, at times that differ by up to {:.1} % of the time from one image to the next: {} images are {} {}, each image \
          at its own time",
         100.0 * widest / interval,
         views.len(),
-        frame + 1
+        frame + 1,
+        plural(frame + 1, "frame", "frames")
     ));
 }
 

@@ -6,7 +6,7 @@ use super::npy::read_npy;
 use super::{colmap, video};
 use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_bytes};
 use cc4dgs_core::reader::pose::world_to_camera;
-use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
+use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -55,9 +55,11 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let footage = footage(path, options, limits, &mut scene.warnings)?;
     if footage.len() != array.shape[0] {
         let problem = format!(
-            "it has {} rows, {} cameras were found ({})",
+            "it has {} {}, {} {} found ({})",
             array.shape[0],
+            plural(array.shape[0], "row", "rows"),
             footage.len(),
+            plural(footage.len(), "camera was", "cameras were"),
             footage.iter().take(40).map(|f| f.name.as_str()).collect::<Vec<_>>().join(", ")
         );
         return Err(bad(problem, "Remove the row together with the camera"));
@@ -65,7 +67,8 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let frames = footage.iter().map(|f| f.images.len()).min().unwrap_or(0);
     let longest = footage.iter().map(|f| f.images.len()).max().unwrap_or(0);
     if let Some(shortest) = footage.iter().find(|f| f.images.len() == frames && frames < longest) {
-        scene.warnings.push(format!("cameras have {frames} ({}) to {longest} frames; the first {frames} of each are used", shortest.name));
+        let used = if frames == 1 { "one of each is".to_string() } else { format!("{frames} of each are") };
+        scene.warnings.push(format!("cameras have {frames} ({}) to {longest} frames; the first {used} used", shortest.name));
     }
     if array.shape[0] < LEAST_HELD_OUT && options.test_cameras.is_none() {
         scene.warnings.push(NOTHING_HELD_OUT.into());
@@ -192,7 +195,8 @@ fn frames(mut files: Vec<PathBuf>, step: Option<u64>, warnings: &mut Vec<String>
     }
     if count > files.len() {
         let folder = files.first().and_then(|f| f.parent()).map(|f| f.display().to_string()).unwrap_or_default();
-        warnings.push(format!("{folder}: {} of {count} frames are missing", count - files.len()));
+        let missing = count - files.len();
+        warnings.push(format!("{folder}: {missing} of {count} frames {} missing", plural(missing, "is", "are")));
     }
     let mut images = vec![None; count];
     for (path, &number) in files.into_iter().zip(&numbers) {
@@ -272,6 +276,6 @@ mod tests {
         // A camera and the number of its frame.
         in_order(&["cam1.8.png", "cam1.9.png", "cam1.10.png"]);
         let (images, said) = read(&["0.50.png", "0.75.png", "1.25.png", "1.50.png"]);
-        assert!(images.len() == 5 && images[2].is_none() && said[0].contains("1 of 5 frames are missing"), "{images:?} {said:?}");
+        assert!(images.len() == 5 && images[2].is_none() && said[0].contains("1 of 5 frames is missing"), "{images:?} {said:?}");
     }
 }

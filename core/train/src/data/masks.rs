@@ -1,15 +1,17 @@
 //! Masks that come with a dataset and that its reader does not use: a warning says so, and what helps.
 
+use cc4dgs_core::plural;
 use std::path::Path;
 
 /// What is done, and what helps.
-const INSTEAD: &str = "are not used, and all of each image is trained on (for an object without its surroundings, write the masks into the alpha channel of \
+const INSTEAD: &str = "not used, and all of each image is trained on (for an object without its surroundings, write the masks into the alpha channel of \
                        PNG images: transparent pixels show scene.background)";
 
 /// Says so where `count` images of a JSON have a `mask_path`.
 pub(super) fn warn_of_mask_paths(count: usize, warnings: &mut Vec<String>) {
     if count > 0 {
-        warnings.push(format!("{count} images have a mask_path; their masks {INSTEAD}"));
+        let [have, masks] = [plural(count, "image has", "images have"), plural(count, "its mask is", "their masks are")];
+        warnings.push(format!("{count} {have} a mask_path; {masks} {INSTEAD}"));
     }
 }
 
@@ -17,7 +19,7 @@ pub(super) fn warn_of_mask_paths(count: usize, warnings: &mut Vec<String>) {
 pub(super) fn warn_of_mask_folder(folders: &[&Path], warnings: &mut Vec<String>) {
     let has_files = |folder: &Path| std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some());
     if let Some(masks) = folders.iter().map(|folder| folder.join("masks")).find(|masks| has_files(masks)) {
-        warnings.push(format!("the masks in {} {INSTEAD}", masks.display()));
+        warnings.push(format!("the masks in {} are {INSTEAD}", masks.display()));
     }
 }
 
@@ -47,5 +49,7 @@ mod tests {
         assert!(warnings.is_empty());
         warn_of_mask_paths(3, &mut warnings);
         assert!(warnings[0].starts_with("3 images have a mask_path; their masks are not used") && warnings[0].contains("alpha channel"), "{warnings:?}");
+        warn_of_mask_paths(1, &mut warnings);
+        assert!(warnings[1].starts_with("1 image has a mask_path; its mask is not used"), "{warnings:?}");
     }
 }

@@ -9,7 +9,7 @@ use super::masks::warn_of_mask_paths;
 use super::ply_points;
 use super::video::{self, Footage};
 use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_bytes, read_json};
-use cc4dgs_core::{DepthFile, Error, ImageSource, Limits, Plugin, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
+use cc4dgs_core::{DepthFile, Error, ImageSource, Limits, Plugin, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::collections::{BTreeMap, BTreeSet};
@@ -156,18 +156,21 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image });
     }
     if depth_of_videos > 0 {
-        scene.warnings.push(format!("{depth_of_videos} videos have a depth_file_path, which is read for images alone; their depth is unknown"));
+        let [have, their] = [plural(depth_of_videos, "video has", "videos have"), plural(depth_of_videos, "its", "their")];
+        scene.warnings.push(format!("{depth_of_videos} {have} a depth_file_path, which is read for images alone; {their} depth is unknown"));
     }
     if missing_depth > 0 {
-        scene.warnings.push(format!("{missing_depth} images have a depth_file_path that names no file; their depth is unknown"));
+        let [have, their] = [plural(missing_depth, "image has", "images have"), plural(missing_depth, "its", "their")];
+        scene.warnings.push(format!("{missing_depth} {have} a depth_file_path that names no file; {their} depth is unknown"));
     }
     if !missing.is_empty() {
         let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         scene.warnings.push(format!(
-            "{} of {} {} are missing and were skipped: {shown}{}",
+            "{} of {} {} {} skipped: {shown}{}",
             missing.len(),
             transforms.frames.len(),
             if has_times { "images" } else { "videos" },
+            plural(missing.len(), "is missing and was", "are missing and were"),
             if missing.len() > 3 { ", …" } else { "" }
         ));
     }
@@ -175,7 +178,8 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         scene.warnings.push(NOTHING_HELD_OUT.into());
     }
     if unlisted > 0 {
-        scene.warnings.push(format!("{unlisted} images are in none of train_filenames, test_filenames and val_filenames, and were skipped"));
+        let [are, were] = [plural(unlisted, "image is", "images are"), plural(unlisted, "was", "were")];
+        scene.warnings.push(format!("{unlisted} {are} in none of train_filenames, test_filenames and val_filenames, and {were} skipped"));
     }
     warn_of_mask_paths(transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count(), &mut scene.warnings);
     if has_times {

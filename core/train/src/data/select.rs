@@ -1,7 +1,7 @@
 //! Which views of a dataset a scene has: frames, held-out cameras, missing images, the cap on training views.
 
 use super::Trained;
-use cc4dgs_core::{CameraRef, Error, ImageSource, RawScene, RawView, Result, SceneOptions, Split, View};
+use cc4dgs_core::{CameraRef, Error, ImageSource, RawScene, RawView, Result, SceneOptions, Split, View, plural};
 
 /// How far beyond the first and last time of training a time may be and still count as that time.
 const SAME: f64 = 1e-6;
@@ -90,7 +90,7 @@ fn choose_frames(raw: &mut RawScene, options: &SceneOptions, available: usize) -
     }
     let found = count(&raw.views);
     if wanted > found {
-        raw.warnings.push(format!("scene.frames asks for {wanted} frames from {start} on, {found} exist"));
+        raw.warnings.push(format!("scene.frames asks for {wanted} frames from {start} on, {found} {}", plural(found, "exists", "exist")));
     }
     Ok(())
 }
@@ -105,7 +105,8 @@ fn drop_missing(raw: &mut RawScene) {
         missing.sort();
         let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         let more = if missing.len() > 3 { ", …" } else { "" };
-        raw.warnings.push(format!("{} images the dataset names are missing and were skipped: {shown}{more}", missing.len()));
+        let named = plural(missing.len(), "image the dataset names is missing and was", "images the dataset names are missing and were");
+        raw.warnings.push(format!("{} {named} skipped: {shown}{more}", missing.len()));
     }
 }
 

@@ -2,7 +2,7 @@
 
 use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_text};
 use cc4dgs_core::reader::pose::from_quaternion;
-use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
+use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -68,7 +68,8 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
     if let Some(range) = range.filter(|_| images.len() < found) {
         let (more, last) = (found - images.len(), range.end - 1);
-        scene.warnings.push(format!("{more} images are outside of frames {} to {last}, on which {scene_name} is evaluated, and were skipped", range.start));
+        let [are, were] = [plural(more, "image is", "images are"), plural(more, "was", "were")];
+        scene.warnings.push(format!("{more} {are} outside of frames {} to {last}, on which {scene_name} is evaluated, and {were} skipped", range.start));
     }
     for (index, row) in rows.iter().enumerate() {
         let bad = |problem: String| Error::data(format!("{}: camera {index}", file.display()), problem, "Fetch the file again");

@@ -2,6 +2,7 @@
 
 use super::text::html;
 use crate::sweep::{CellResult, TrainingDevices};
+use cc4dgs_core::plural;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
@@ -35,15 +36,19 @@ pub fn facts(results: &[CellResult]) -> String {
     let device = |r: &CellResult| {
         let d = &r.provenance.device;
         let adapter = d.adapter.as_ref().map_or_else(String::new, |name| format!(" on {name}, driver {}", d.driver.as_deref().unwrap_or("unknown")));
-        format!("{}{adapter}; {}, {} threads, {}", d.name, if d.processor.is_empty() { "unknown processor" } else { &d.processor }, d.threads, d.system)
+        let (processor, threads) = (if d.processor.is_empty() { "unknown processor" } else { &d.processor }, plural(d.threads, "thread", "threads"));
+        format!("{}{adapter}; {processor}, {} {threads}, {}", d.name, d.threads, d.system)
     };
-    let data =
-        |r: &CellResult| format!("{}: {} (xxh3 {}), {}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_sizes(), r.frames);
+    let data = |r: &CellResult| {
+        let (data, frames) = (&r.provenance.data, plural(r.frames, "frame", "frames"));
+        format!("{}: {} (xxh3 {}), {}, {} {frames}", r.axes.scene, data.path, data.hash, r.image_sizes(), r.frames)
+    };
+    let [cells, of] = [plural(results.len(), "cell", "cells"), plural(trainings.len(), "training", "trainings")];
     let mut rows = vec![
         ("sweep", set(&|r| r.sweep.clone())),
         (
             "results",
-            format!("{} cells of {} trainings, seeds {}", results.len(), trainings.len(), seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")),
+            format!("{} {cells} of {} {of}, seeds {}", results.len(), trainings.len(), seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")),
         ),
         ("program", set(&|r| format!("cc4dgs {}, commit {}", r.provenance.version, commit(r)))),
         ("device", set(&device)),
@@ -65,8 +70,9 @@ pub fn facts(results: &[CellResult]) -> String {
 pub fn scored(results: &[CellResult]) -> String {
     let all = |r: &CellResult| r.metrics.values().find_map(|score| score.protocol.get("frames")?.get("of")?.as_u64());
     let of_scene = |r: &CellResult| {
-        let of = all(r).map_or_else(String::new, |count| format!(" of {count}"));
-        format!("{} {}{of} images", r.axes.scene, r.images.len())
+        let (all, scored) = (all(r), r.images.len() as u64);
+        let of = all.map_or_else(String::new, |count| format!(" of {count}"));
+        format!("{} {scored}{of} {}", r.axes.scene, plural(all.unwrap_or(scored), "image", "images"))
     };
     let scenes: BTreeSet<String> = results.iter().map(of_scene).collect();
     let split = results.first().map_or_else(String::new, |r| format!("{:?}", r.split).to_lowercase());

@@ -217,7 +217,7 @@ fn times_of_trainings_on_other_devices_are_marked() {
     let notes = made.markdown.matches("Training times are wall times on").count();
     assert!(notes == 1 && made.markdown.contains("do not compare") && !made.markdown.contains("**1.00"), "{}", made.markdown);
     assert!(made.html.contains("1.00 ±\u{a0}0.00 [1, 2]") && made.html.contains("3.00 ±\u{a0}0.00 [1]"), "{}", made.markdown);
-    assert!(made.csv.lines().nth(1).unwrap().contains(" 1 threads; linux x86_64 + flex; "), "{}", made.csv);
+    assert!(made.csv.lines().nth(1).unwrap().contains(" 1 thread; linux x86_64 + flex; "), "{}", made.csv);
     // So are the plots of these times, and no others.
     let marked = plots(&made, "Training times are wall times on [1] flex");
     assert!(marked.contains(&"tiny-psnr-against-training-time.svg".to_string()) && marked.iter().all(|name| name.contains("time")), "{marked:?}");

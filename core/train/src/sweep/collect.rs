@@ -8,7 +8,7 @@ use super::result::{Axes, CellResult, KIND};
 use super::table::{CSV_START, NOTE, csv, markdown};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_other_content;
-use cc4dgs_core::{Error, Result};
+use cc4dgs_core::{Error, Result, plural};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -105,7 +105,8 @@ impl Collection {
         let named: Vec<&str> = self.missing.iter().take(NAMED).map(|m| m.axes.as_str()).collect();
         let more = self.missing.len().saturating_sub(NAMED);
         let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
-        (!self.missing.is_empty()).then(|| format!("{} of {} cells of the sweep are missing: {}{rest}.", self.missing.len(), self.planned, named.join("; ")))
+        let (count, are) = (self.missing.len(), plural(self.missing.len(), "is", "are"));
+        (count > 0).then(|| format!("{count} of {} cells of the sweep {are} missing: {}{rest}.", self.planned, named.join("; ")))
     }
     /// Refuses a sweep that is not complete.
     ///
@@ -118,7 +119,8 @@ impl Collection {
         let named: Vec<String> = self.missing.iter().take(NAMED).map(|m| format!("{} ({}): {}", m.cell, m.axes, m.reason)).collect();
         let more = self.missing.len().saturating_sub(NAMED);
         let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
-        let problem = format!("{} of {} cells are missing: {}{rest}", self.missing.len(), self.planned, named.join("; "));
+        let (count, are) = (self.missing.len(), plural(self.missing.len(), "is", "are"));
+        let problem = format!("{count} of {} cells {are} missing: {}{rest}", self.planned, named.join("; "));
         let remedy = "Run it again: cc4dgs sweep run DIR does what is missing and nothing else; --partial makes tables of what is there";
         Err(Error::data(format!("sweep {}", folder.root().display()), problem, remedy))
     }
@@ -217,7 +219,7 @@ mod tests {
         let message = partial.check_complete(&folder).unwrap_err().to_string();
         assert!([all[1].id.as_str(), "tiny own base seed 0 half", "damaged", "not begun"].iter().all(|part| message.contains(part)), "{message}");
         let gap = partial.gap().unwrap();
-        assert_eq!(gap, "1 of 2 cells of the sweep are missing: tiny own base seed 0 half.");
+        assert_eq!(gap, "1 of 2 cells of the sweep is missing: tiny own base seed 0 half.");
         let tables = write_tables(&folder, &partial.results, &partial.results, Some(&gap)).unwrap();
         assert!(std::fs::read_to_string(tables.markdown).unwrap().contains(&format!("\n\n{gap}\n\n")));
         all[1].write(&folder.result(&all[1].id)).unwrap();

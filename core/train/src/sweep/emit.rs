@@ -2,7 +2,7 @@
 
 use super::location::variable_of;
 use super::plan::Plan;
-use cc4dgs_core::{Error, Result};
+use cc4dgs_core::{Error, Result, plural};
 use std::collections::BTreeMap;
 use std::env::VarError;
 
@@ -186,13 +186,19 @@ fn job_name(plan: &Plan) -> String {
     format!("cc4dgs-{}", name.trim_matches('-'))
 }
 
+/// How much there is to do, such as `1 training, 3 cells`.
+fn extent(plan: &Plan) -> String {
+    let (trainings, cells) = (plan.trainings.len(), plan.cells.len());
+    format!("{trainings} {}, {cells} {}", plural(trainings, "training", "trainings"), plural(cells, "cell", "cells"))
+}
+
 fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
     let last = plan.trainings.len() - 1;
     let throttle = if o.parallel > 0 { format!("%{}", o.parallel) } else { String::new() };
     let output = sbatch_quoted(&format!("{}/slurm-%a.log", folder_of_logs(o).replace('%', "%%")));
     format!(
         r#"#!/bin/bash
-# {trainings} trainings, {cells} cells. Submit with: sbatch FILE. A task that is stopped before its time limit, or preempted, leaves a checkpoint and
+# {extent}. Submit with: sbatch FILE. A task that is stopped before its time limit, or preempted, leaves a checkpoint and
 # is queued again; finished cells are never run twice. A task that is cancelled leaves a checkpoint, too, and is not queued again.
 #SBATCH --job-name={name}
 #SBATCH --array=0-{last}{throttle}
@@ -223,8 +229,7 @@ if [ "$notice" ] && [ "$code" -eq {INTERRUPTED} ]; then
 fi
 exit "$code"
 "#,
-        trainings = plan.trainings.len(),
-        cells = plan.cells.len(),
+        extent = extent(plan),
         name = job_name(plan),
         threads = o.threads,
         memory = u64::from(o.memory_gb) * 1_000_000_000 / (1 << 20),
@@ -244,7 +249,7 @@ fn kubernetes(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>
     let literal = |text: &str| yaml(&text.replace('$', "$$"));
     let variable = |(name, value): (&String, &String)| format!("        - name: {}\n          value: {}\n", yaml(name), literal(value));
     format!(
-        r#"# {trainings} trainings, {cells} cells. Submit with: kubectl apply -f FILE. Interrupted and evicted pods, and pods at their time limit, are replaced
+        r#"# {extent}. Submit with: kubectl apply -f FILE. Interrupted and evicted pods, and pods at their time limit, are replaced
 # and go on from the checkpoint; codes after which the same command would fail again end their index only. Needs Kubernetes 1.33, or 1.29 with its defaults.
 apiVersion: batch/v1
 kind: Job
@@ -302,7 +307,7 @@ spec:
           claimName: {claim}
 "#,
         trainings = plan.trainings.len(),
-        cells = plan.cells.len(),
+        extent = extent(plan),
         name = job_name(plan),
         finals = FINAL.map(|code| code.to_string()).join(", "),
         image = yaml(&o.image),
@@ -327,7 +332,7 @@ fn skypilot(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) 
     let (program, folder, limits) = (quoted(&o.program), quoted(&o.folder), limit_options(o));
     let command = format!("{limit} {program} --quiet --threads {} {limits}sweep run {folder} --plan {} --index \"$INDEX\"", o.threads, plan.id());
     format!(
-        r#"# {trainings} trainings, {cells} cells. Launch one managed job per index:
+        r#"# {extent}. Launch one managed job per index:
 #   for index in $(seq 0 {last}); do sky jobs launch --yes --detach-run --name "{name}-$index" --env INDEX="$index" FILE; done
 # A machine that is taken away is replaced, and the training goes on from its checkpoint in the bucket. A job that reaches its time limit is restarted
 # up to three times, as after an error.
@@ -356,8 +361,7 @@ run: |
     *) exit "$code" ;;
   esac
 "#,
-        trainings = plan.trainings.len(),
-        cells = plan.cells.len(),
+        extent = extent(plan),
         threads = o.threads,
         memory = o.memory_gb,
         variables = variables.iter().map(|(name, value)| format!("  {}: {}\n", yaml(name), yaml(value))).collect::<String>(),

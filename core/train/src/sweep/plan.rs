@@ -10,7 +10,7 @@ use crate::config::RunConfig;
 use crate::layers::Layers;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_other_content;
-use cc4dgs_core::{Error, Registry, Result, config};
+use cc4dgs_core::{Error, Registry, Result, config, plural};
 use cc4dgs_play::field_weights::FieldWeights;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -329,7 +329,10 @@ fn refuse_image_sizes(trainings: &[PlannedTraining], registry: &Registry) -> Res
         }
         let first = *chosen.entry(&training.scene).or_insert(training);
         if first.minutes != training.minutes {
-            let of = |training: &PlannedTraining| format!("'{}' has {} minutes", training.label(), training.minutes.unwrap_or_default());
+            let of = |training: &PlannedTraining| {
+                let minutes = training.minutes.unwrap_or_default();
+                format!("'{}' has {minutes} {}", training.label(), plural(minutes, "minute", "minutes"))
+            };
             let problem = format!("{} and {}: `auto` may choose another image size for each, and no table compares these", of(first), of(training));
             let remedy = "State scene.width, scene.height or scene.downscale in `set` of the grid or of the scene, or leave `size` out";
             return Err(Error::parameter("size", problem, remedy));

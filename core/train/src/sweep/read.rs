@@ -2,7 +2,7 @@
 
 use super::lines::{PATCH, read_lines};
 use super::result::{CellResult, KIND};
-use cc4dgs_core::{Error, Result};
+use cc4dgs_core::{Error, Result, plural};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -109,7 +109,10 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
             return Err(mixed("image sizes", same_scene, &format!("{}x{}", a[0], a[1]), result, &format!("{}x{}", b[0], b[1])));
         }
         if images(same_scene) != images(result) {
-            let of = |r: &CellResult| format!("{} images of {} frames", r.images.len(), r.frames);
+            let of = |r: &CellResult| {
+                let [images, frames] = [plural(r.images.len(), "image", "images"), plural(r.frames, "frame", "frames")];
+                format!("{} {images} of {} {frames}", r.images.len(), r.frames)
+            };
             return Err(mixed("sets of images", same_scene, &of(same_scene), result, &of(result)));
         }
         // The first image may be one that both leave as small as it is.
@@ -141,7 +144,8 @@ fn images(result: &CellResult) -> Vec<(&str, usize)> {
 pub(super) fn describe(device: &super::result::DeviceFacts) -> String {
     let adapter = device.adapter.as_ref().map_or_else(String::new, |name| format!(" on {name}, driver {}", device.driver.as_deref().unwrap_or("unknown")));
     let processor = if device.processor.is_empty() { "unknown processor" } else { &device.processor };
-    format!("{}{adapter}, {processor}, {} threads, {}", device.name, device.threads, device.system)
+    let threads = plural(device.threads, "thread", "threads");
+    format!("{}{adapter}, {processor}, {} {threads}, {}", device.name, device.threads, device.system)
 }
 
 /// The first of the `wanted` entries that differs, as it is in both.

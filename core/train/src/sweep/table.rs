@@ -4,7 +4,7 @@ use super::mixture;
 use super::read::check_comparable;
 use super::result::{CellResult, Outcome};
 use super::trained::{TrainingDevices, trained_on};
-use cc4dgs_core::{Error, Result};
+use cc4dgs_core::{Error, Result, plural};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
@@ -103,11 +103,12 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     // Writing to a string cannot fail.
     let _ = writeln!(
         text,
-        "{NOTE} Device {}{adapter}, {}, {} threads, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
+        "{NOTE} Device {}{adapter}, {}, {} {}, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
          Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.{}{sentence}",
         device.name,
         if device.processor.is_empty() { "unknown processor" } else { &device.processor },
         device.threads,
+        plural(device.threads, "thread", "threads"),
         device.system,
         commits.into_iter().collect::<Vec<_>>().join(", "),
         format!("{:?}", first.split).to_lowercase(),
@@ -117,7 +118,8 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     for scene in scenes {
         let of_scene: Vec<&Row> = rows.iter().filter(|row| row.axes[0] == scene).collect();
         let one = of_scene[0].results[0];
-        let _ = writeln!(text, "\n## {scene}\n\n{} images of {}.\n", one.images.len(), one.image_sizes());
+        let images = plural(one.images.len(), "image", "images");
+        let _ = writeln!(text, "\n## {scene}\n\n{} {images} of {}.\n", one.images.len(), one.image_sizes());
         let mut headings = vec!["method", "setting", "codec", "seeds"];
         headings.extend(metrics.iter().map(|m| m.1));
         headings.extend(["MB", "Gaussians", "training s", "encode s", "decode s", "frame ms", ""]);
@@ -225,10 +227,10 @@ mod tests {
         let results = two_seeds();
         let table = markdown(&results).unwrap();
         assert!(table.contains("| cdf | base | cca | 2 | 31.00 ± 1.41 |") && table.contains("| cdf | base | raw | 1 | 31.25 |"), "{table}");
-        assert!(table.contains("1 hopeless") && table.contains("flex") && table.contains("1 images of 400x400"), "{table}");
+        assert!(table.contains("1 hopeless") && table.contains("flex") && table.contains("1 image of 400x400"), "{table}");
         assert!(!table.contains("LPIPS"), "no result has it: {table}");
         let various: Vec<CellResult> = results.iter().cloned().map(|r| CellResult { sizes_differ: true, ..r }).collect();
-        assert!(markdown(&various).unwrap().contains("1 images of various sizes."));
+        assert!(markdown(&various).unwrap().contains("1 image of various sizes."));
         let csv = csv(&results).unwrap();
         let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
         assert!(lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");
@@ -248,7 +250,7 @@ mod tests {
         assert!(!markdown(&results).unwrap().contains("Training times"), "older results do not say");
         (results[0].training, results[0].cost.training_devices[0].device.threads) = ("other".into(), 8);
         let table = markdown(&results).unwrap();
-        assert!(table.contains("Training times are wall times on [1] flex, Example processor, 1 threads, linux x86_64, host node-1 (trainings: 1)"), "{table}");
+        assert!(table.contains("Training times are wall times on [1] flex, Example processor, 1 thread, linux x86_64, host node-1 (trainings: 1)"), "{table}");
         assert!(table.contains("; [2] flex, Example processor, 8 threads, linux x86_64, host node-1 (trainings: 1);"), "{table}");
         // Of the two seeds of one row, one does not say.
         assert!(table.contains("| 180.2 ± 0.0 [2, ?] |") && table.contains("| 180.2 [1] |"), "{table}");

@@ -88,13 +88,10 @@ mod tests {
         assert_eq!([0, 1, 2].map(|i| found.mark(&[&results[i]])), [" [1]", " [1, 2]", " [?]"]);
         assert_eq!(found.mark(&[&results[0], &results[2]]), " [1, ?]");
         let sentence = found.sentence();
-        let parts = [
-            "on [1] flex, Example processor, 1 threads, linux x86_64, host node-1",
-            "; [2] flex, Example processor, 8 threads, linux x86_64",
-            "do not compare",
-        ];
+        let parts =
+            ["on [1] flex, Example processor, 1 thread, linux x86_64, host node-1", "; [2] flex, Example processor, 8 threads, linux x86_64", "do not compare"];
         assert!(parts.iter().all(|part| sentence.contains(part)), "{sentence}");
-        assert_eq!(trained_on(&[&results[0]]), "flex; Example processor; 1 threads; linux x86_64");
+        assert_eq!(trained_on(&[&results[0]]), "flex; Example processor; 1 thread; linux x86_64");
         assert_eq!(trained_on(&[&results[1]]).split(" + ").count(), 2);
         assert_eq!(trained_on(&[&results[2]]), "");
     }

@@ -7,7 +7,7 @@ use super::{Context, TrainState};
 use crate::data::init::{KeyFrames, KeyPoint, LEAST_INTERVAL, limit_sizes_to};
 use crate::init::{SH_C0, from_points};
 use crate::masks::DynamicMask;
-use cc4dgs_core::{Camera, DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value};
+use cc4dgs_core::{Camera, DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value, plural};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use glam::Vec3;
@@ -92,7 +92,8 @@ impl Context<'_> {
         }
         plan.report.cloned = points.len();
         let (count, keys) = (points.len(), times.keys.len());
-        let message = format!("{count} points of {keys} key frames, {capped} made smaller; {temporary} Gaussians of the first frame are there for a while");
+        let [noun, are] = [plural(count, "point", "points"), plural(temporary, "Gaussian of the first frame is", "Gaussians of the first frame are")];
+        let message = format!("{count} {noun} of {keys} key frames, {capped} made smaller; {temporary} {are} there for a while");
         self.job.events.emit(&Event::Note { object: "key frames".into(), message });
         let schedule = self.lengths.schedule(Stage::Main, 0);
         plan.check("key frames", &state.set.gaussians()?)?;

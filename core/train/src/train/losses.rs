@@ -52,17 +52,30 @@ impl LossTerms {
     fn of_depth(&self) -> Option<&Term> {
         self.0.iter().find(|term| term.term.wants_depth())
     }
+    /// The first term that compares recorded depth, as messages name it, and the problem, where no training view of `scene` has any.
+    fn without_depth(&self, scene: &Scene) -> Result<Option<(String, String)>> {
+        let Some(Term { name, .. }) = self.of_depth() else { return Ok(None) };
+        if scene.has_depth()? {
+            return Ok(None);
+        }
+        Ok(Some((format!("loss {name}"), format!("it compares recorded depth, and no training view of {} has any", scene.name))))
+    }
     /// Refuses terms that compare recorded depth where no training view of `scene` has it.
     pub fn check_depth(&self, scene: &Scene) -> Result<()> {
-        let Some(Term { name, .. }) = self.of_depth() else { return Ok(()) };
-        if scene.has_depth()? {
-            return Ok(());
+        let Some((object, problem)) = self.without_depth(scene)? else { return Ok(()) };
+        let remedy = "Name the 16-bit PNG files of depth as depth_file_path in transforms.json, or remove the term";
+        Err(Error::parameter(object, problem, remedy))
+    }
+    /// As [`LossTerms::check_depth`], for the further training of a model: refuses `scene` only where no other term is left. Else returns object and message of
+    /// the warning that the terms of depth are left out, if there are some.
+    pub fn check_depth_further(&self, scene: &Scene) -> Result<Option<(String, String)>> {
+        let Some((object, problem)) = self.without_depth(scene)? else { return Ok(None) };
+        if self.0.iter().all(|term| term.term.wants_depth()) {
+            let problem = format!("{problem}, so that no term of the loss has anything to optimise");
+            let remedy = "Give the scene with the depth that the model was trained on, or train no further: compress with finetune=0, prune with --refit 0";
+            return Err(Error::parameter(object, problem, remedy));
         }
-        Err(Error::parameter(
-            format!("loss {name}"),
-            format!("it compares recorded depth, and no training view of {} has any", scene.name),
-            "Name the 16-bit PNG files of depth as depth_file_path in transforms.json, or remove the term",
-        ))
+        Ok(Some((object, format!("{problem}: the model is trained further with the other terms of the loss alone"))))
     }
     /// Refuses terms that compare recorded depth, of which the score stage has none.
     pub fn refuse_depth(&self) -> Result<()> {
@@ -123,7 +136,8 @@ fn read(section: &toml::Table) -> Result<Listed> {
 mod tests {
     use super::*;
     use burn::tensor::{Device, Int};
-    use cc4dgs_core::{Camera, Gaussians, HostGaussians, Schedule, Split, View};
+    use cc4dgs_core::{Camera, DepthImage, FrameSource, Gaussians, HostGaussians, Image8, NoImages, Schedule, Split, View};
+    use std::sync::Arc;
 
     /// As many ones.
     struct Ones(usize);
@@ -132,6 +146,62 @@ mod tests {
         fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
             Ok(Some(Tensor::ones([self.0], &input.planes.device())))
         }
+    }
+
+    /// Compares recorded depth.
+    struct OfDepth;
+
+    impl LossTerm for OfDepth {
+        fn value(&self, _: &LossInput) -> Result<Option<Tensor<1>>> {
+            Ok(None)
+        }
+        fn wants_depth(&self) -> bool {
+            true
+        }
+    }
+
+    /// Depth of a pixel, and no images.
+    struct Deep;
+
+    impl FrameSource for Deep {
+        fn load(&self, view: usize) -> Result<Image8> {
+            NoImages.load(view)
+        }
+        fn depth(&self, _: usize) -> Result<Option<DepthImage>> {
+            Ok(Some(DepthImage { width: 1, height: 1, values: vec![2.0] }))
+        }
+    }
+
+    #[test]
+    fn depth_that_is_not_there_is_refused_or_left_out_by_one_rule() {
+        let scene = |source: Arc<dyn FrameSource>| {
+            let camera = Camera::look_at("a", (1, 1), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+            let view = View { camera: 0, frame: 0, time_norm: 0.0, split: Split::Train };
+            Scene::new("flat", vec![camera], vec![view], source, 0).unwrap()
+        };
+        let (flat, deep) = (scene(Arc::new(NoImages)), scene(Arc::new(Deep)));
+        let term = |name: &str, term: Box<dyn LossTerm>| Term { name: name.into(), weight: 1.0, term };
+        let [none, alone, beside] = [0, 1, 2].map(|case| {
+            let ones = (case != 1).then(|| term("ones", Box::new(Ones(1))));
+            let of_depth = (case > 0).then(|| term("far", Box::new(OfDepth)));
+            LossTerms(ones.into_iter().chain(of_depth).collect())
+        });
+        let further = |terms: &LossTerms, scene: &Scene| terms.check_depth_further(scene).map_err(|e| e.to_string());
+        for terms in [&none, &alone, &beside] {
+            assert!(terms.check_depth(&deep).is_ok());
+            assert_eq!(further(terms, &deep), Ok(None));
+        }
+        assert!(none.check_depth(&flat).is_ok());
+        assert_eq!(further(&none, &flat), Ok(None));
+        // A training that asks for depth gets it, whatever else it asks for.
+        for terms in [&alone, &beside] {
+            let message = terms.check_depth(&flat).unwrap_err().to_string();
+            assert!(message.starts_with("loss far: it compares recorded depth, and no training view of flat has any. "), "{message}");
+        }
+        let message = further(&alone, &flat).unwrap_err();
+        assert!(message.starts_with("loss far: it compares recorded depth, and no training view of flat has any, so that no term"), "{message}");
+        let (object, message) = further(&beside, &flat).unwrap().unwrap();
+        assert!(object == "loss far" && message.contains("no training view of flat has any") && message.contains("other terms"), "{object}: {message}");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use super::sampler::Sampler;
 use super::tune::{CHECK_EVERY, TuneJob, Tuner, rate_at};
 use super::{RateFactors, TrainState};
 use burn::tensor::Device;
-use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, TuneModel, TunedModel};
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, TuneModel, TunedModel, plural};
 use cc4dgs_play::prune::{PruneReport, at_rows, by_contribution, contributions};
 use cc4dgs_play::{Model, load_weights, weights_of};
 use std::sync::Arc;
@@ -28,7 +28,8 @@ const DEFORMER_RATE: f64 = 0.3;
 /// one re-fit gives by itself, with nothing removed, is measured too. A round that fails is the last, and the ones before are kept where they removed some.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a drop that is not positive or a scene without training views, [`Error::Interrupted`], and what scene and rasterizer report.
+/// [`Error::Parameter`] for a drop that is not positive, a scene without training views, and one without recorded depth where all loss terms compare it (else a
+/// warning says that such terms are left out), [`Error::Interrupted`], and what scene and rasterizer report.
 pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, iterations: usize, job: &RefitJob<'_>) -> Result<PruneReport> {
     if !(max_drop_db > 0.0 && max_drop_db.is_finite()) {
         return Err(Error::parameter("prune", format!("a drop of {max_drop_db} dB"), "Allow a positive number of dB, such as 0.1"));
@@ -45,7 +46,8 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         (tuner.psnr(&start.gaussians, &start.weights, None)?, alone)
     };
     if let Some(alone) = psnr_refit_alone_db {
-        let message = format!("{before} Gaussians, {psnr_before_db:.3} dB; {alone:.3} dB after re-fit with nothing removed");
+        let noun = plural(before, "Gaussian", "Gaussians");
+        let message = format!("{before} {noun}, {psnr_before_db:.3} dB; {alone:.3} dB after re-fit with nothing removed");
         job.events.emit(&Event::Note { object: "prune".into(), message });
     }
     let (mut share, mut psnr_after_db, mut last_order) = (FIRST_SHARE, psnr_before_db, None);

@@ -6,7 +6,7 @@ use super::{Context, TrainState};
 use crate::sample::spread_views;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, DensityPlan, Event, Result, Schedule, Split, Stage};
+use cc4dgs_core::{Camera, DensityPlan, Event, Result, Schedule, Split, Stage, plural};
 use cc4dgs_play::Moving;
 
 /// When it is looked at: shares of the main stage.
@@ -62,7 +62,8 @@ impl Context<'_> {
         if settled == 0 || settled == moving.len() {
             return Ok(());
         }
-        let message = format!("{settled} of {} moving Gaussians move by less than {most_px} pixels: they stand still from now on", moving.len());
+        let [moves, stand] = [plural(settled, "moves", "move"), plural(settled, "it stands", "they stand")];
+        let message = format!("{settled} of {} moving Gaussians {moves} by less than {most_px} pixels: {stand} still from now on", moving.len());
         self.job.events.emit(&Event::Note { object: "deformer".into(), message });
         let count = scores.len();
         state.set.set("dynamic_scores", Tensor::from_data(TensorData::new(scores, [count, 1]), &self.device))?;

@@ -7,7 +7,7 @@
 use super::tune::TuneJob;
 use crate::config::RunConfig;
 use crate::sample::spread;
-use cc4dgs_core::{DepthImage, Error, Event, FrameSource, Image8, Result, Scene, Split, config};
+use cc4dgs_core::{DepthImage, Error, Event, FrameSource, Image8, Result, Scene, Split, config, plural};
 use cc4dgs_play::{Model, Player};
 use glam::{DMat3, DMat4, DVec3, DVec4};
 use std::collections::BTreeMap;
@@ -57,7 +57,8 @@ pub(super) fn targets(job: &TuneJob) -> Result<Arc<Scene>> {
         maps.insert(camera, inverse(fit.map()));
         job.events.emit(&Event::Progress { task: "comparing colours".into(), done: maps.len() as u64, total: views.len() as u64 });
     }
-    let message = format!("trained with colours per camera, which models do not keep: the images of {} cameras are brought to its own colours", maps.len());
+    let cameras = format!("{} {}", maps.len(), plural(maps.len(), "camera", "cameras"));
+    let message = format!("trained with colours per camera, which models do not keep: the images of {cameras} are brought to its own colours");
     job.events.emit(&Event::Note { object: "model".into(), message });
     Ok(Arc::new(recoloured(scene, background, maps)?))
 }

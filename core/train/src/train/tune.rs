@@ -67,7 +67,7 @@ pub struct TuneJob<'a> {
 }
 
 /// Trains a model with rounded values, with the loss and the optimizer that it was trained with. Density control, appearance, smoothness and noise are left
-/// out.
+/// out. Loss terms of recorded depth are left out, with a warning, where the scene has none; a loss of such terms alone is an error.
 ///
 /// Nothing is looked at before a codec asks for it.
 pub struct Tuner<'a> {
@@ -87,13 +87,28 @@ impl<'a> Tuner<'a> {
     pub(super) fn with_targets(self, targets: Arc<Scene>) -> Self {
         Self { targets: OnceCell::from(targets), ..self }
     }
-    /// The scene with the images to train on.
+    /// The scene with the images to train on. Recorded depth is looked for once, before they are first used.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] where all loss terms compare recorded depth and the scene has none, [`Error::Interrupted`], and what scene and device report.
     pub(super) fn targets(&self) -> Result<&Arc<Scene>> {
         if let Some(known) = self.targets.get() {
             return Ok(known);
         }
+        self.check_depth()?;
         let found = targets(&self.job)?;
         Ok(self.targets.get_or_init(|| found))
+    }
+    /// Warns of loss terms that compare recorded depth where the scene has none.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] where the loss has no other terms.
+    fn check_depth(&self) -> Result<()> {
+        let TuneJob { scene, registry, events, .. } = &self.job;
+        if let Some((object, message)) = LossTerms::build(registry, &self.config()?.loss)?.check_depth_further(scene)? {
+            events.emit(&Event::Warning { object, message });
+        }
+        Ok(())
     }
     /// The configuration of the model's training, without what fine-tuning leaves out.
     fn config(&self) -> Result<&RunConfig> {

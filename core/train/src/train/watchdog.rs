@@ -17,7 +17,7 @@ use crate::gaussian_set::GaussianSet;
 use crate::train::{Guard, Neighbours};
 use burn::tensor::Tensor;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Error, Event, OptimizerState, Parameter, Result};
+use cc4dgs_core::{Error, Event, OptimizerState, Parameter, Result, plural};
 use std::collections::BTreeMap;
 
 /// Iterations between two good states.
@@ -222,7 +222,7 @@ impl Watchdog {
         if self.attempts.lowered >= ATTEMPTS || self.attempts.repeated > 2 * ATTEMPTS {
             return Err(Error::backend(
                 what,
-                format!("it is not finite, after learning rates were lowered {} times", self.attempts.lowered),
+                format!("it is not finite, after learning rates were lowered {} {}", self.attempts.lowered, plural(self.attempts.lowered, "time", "times")),
                 "Lower the learning rates (train.lr), choose another deformer or loss, or look at the images of this scene",
             ));
         }

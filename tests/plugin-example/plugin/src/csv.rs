@@ -2,7 +2,7 @@
 
 use cc4dgs_core::serde::{self, Deserialize};
 use cc4dgs_core::{
-    Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, HostGaussians, Limits, Plugin, Result, config, inventory, toml,
+    Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, HostGaussians, Limits, Plugin, Result, config, inventory, plural, toml,
 };
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -51,7 +51,8 @@ impl Exporter for Csv {
         }
         table.flush().map_err(failed)?;
         let left_out = gaussians.len() - written;
-        let note = (left_out > 0).then(|| format!("{left_out} Gaussians of an opacity below {} were left out", self.min_opacity));
+        let [noun, were] = [plural(left_out, "Gaussian", "Gaussians"), plural(left_out, "was", "were")];
+        let note = (left_out > 0).then(|| format!("{left_out} {noun} of an opacity below {} {were} left out", self.min_opacity));
         Ok(Exported { gaussians: written, sh_degree: 0, frames: 1, notes: note.into_iter().collect() })
     }
 }

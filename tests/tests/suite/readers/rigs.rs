@@ -60,7 +60,7 @@ fn a_rig_in_split_files_is_one_camera_for_each_pose() {
     let scene = load(dir.path()).unwrap();
     assert_eq!(scene.cameras.len(), 24);
     let said = |part: &str| scene.warnings.iter().any(|w| w.contains(part));
-    assert!(said("24 images have 6 poses, but 1 of them state no time and 1 the same time"), "{:?}", scene.warnings);
+    assert!(said("24 images have 6 poses, but 1 of them states no time and 1 the same time as another image of its pose"), "{:?}", scene.warnings);
 }
 
 #[test]

@@ -285,7 +285,7 @@ fn transforms_and_colmap_may_name_videos() {
     with_depth[1]["depth_file_path"] = "depth/c1.png".into();
     write(&with_depth);
     let warnings = opened(&dir, &options).warnings;
-    assert!(warnings.iter().any(|line| line.starts_with("1 videos have a depth_file_path")), "{warnings:?}");
+    assert!(warnings.iter().any(|line| line.starts_with("1 video has a depth_file_path, which is read for images alone; its")), "{warnings:?}");
     // Frames of a camera with a lens are stored a little larger than they are wanted, not at the size of the video.
     let lens = serde_json::json!({"fl_x": 2.0 * cameras[0].fx, "cx": 64.0, "cy": 48.0, "w": 128, "h": 96, "k1": -0.05, "frames": frames});
     std::fs::write(dir.path().join("transforms.json"), lens.to_string()).unwrap();

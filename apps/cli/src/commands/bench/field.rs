@@ -5,7 +5,7 @@ use crate::args::BenchField;
 use crate::commands::Context;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, SpatialInput, config, parse_device, resolved_device};
+use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, SpatialInput, config, parse_device, plural, resolved_device};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use rand::Rng;
 use serde::Serialize;
@@ -131,8 +131,13 @@ fn text(r: &FieldReport) -> String {
     let saved = 100.0 * (1.0 - r.work.vertices_decoded as f64 / r.work.vertices_queried.max(1) as f64);
     [
         format!(
-            "cdf on {}, {} threads: {} Gaussians, {} weights, {} vertices decoded ({saved:.0} % reused)",
-            r.device, r.threads, r.gaussians, r.parameters, r.work.vertices_decoded
+            "cdf on {}, {} {}: {} Gaussians, {} weights, {} vertices decoded ({saved:.0} % reused)",
+            r.device,
+            r.threads,
+            plural(r.threads, "thread", "threads"),
+            r.gaussians,
+            r.parameters,
+            r.work.vertices_decoded
         ),
         format!("  spatial features           {:>9.2} ms", r.spatial.median_ms),
         format!("  offsets, features cached   {:>9.2} ms", r.deform.median_ms),

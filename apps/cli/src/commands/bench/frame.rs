@@ -12,7 +12,8 @@ use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Result, Seed, Similarity, SpatialInput, config, parse_device, resolved_device,
+    Camera, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Result, Seed, Similarity, SpatialInput, config, parse_device, plural,
+    resolved_device,
 };
 use cc4dgs_play::Moving;
 use cc4dgs_play::RenderConfig;
@@ -243,7 +244,8 @@ fn time_field(field: &mut dyn Deformer, means_world: Tensor<2>, repeats: u32) ->
 }
 
 fn text(report: &FrameReport) -> String {
-    let mut lines = vec![format!("playback on {}, {} threads, deformer {}", report.device, report.threads, report.deformer)];
+    let threads = plural(report.threads, "thread", "threads");
+    let mut lines = vec![format!("playback on {}, {} {threads}, deformer {}", report.device, report.threads, report.deformer)];
     lines.push("case             image  Gaussians  moving  deform ms  raster ms    play ms   frames/s  first ms  spatial ms deform fwd+bwd ms".into());
     lines.extend(report.cases.iter().map(|c| {
         format!(

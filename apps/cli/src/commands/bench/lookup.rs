@@ -7,7 +7,7 @@ use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::lookup::corners;
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup as look_up};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Result, Seed, parse_device, resolved_device};
+use cc4dgs_core::{Result, Seed, parse_device, plural, resolved_device};
 use rand::Rng;
 use serde::Serialize;
 use std::sync::Arc;
@@ -112,8 +112,9 @@ pub fn lookup(context: &Context, args: &BenchLookup) -> Result<()> {
         cases,
     };
     context.output.result(&report, || {
+        let threads = plural(report.threads, "thread", "threads");
         let mut lines = vec![
-            format!("lookups forwards and backwards on {}, {} threads, {} Gaussians", report.device, report.threads, report.gaussians),
+            format!("lookups forwards and backwards on {}, {} {threads}, {} Gaussians", report.device, report.threads, report.gaussians),
             "grid            parameters   rows read   fused ms  primitives ms  speedup  gradients differ by".to_string(),
         ];
         lines.extend(report.cases.iter().map(|c| {

@@ -7,7 +7,7 @@ use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::ops::photometric::photometric_loss;
 use cc4dgs_backends::ops::sort::sort_order;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Result, Seed, parse_device, resolved_device};
+use cc4dgs_core::{Result, Seed, parse_device, plural, resolved_device};
 use rand::Rng;
 use serde::Serialize;
 
@@ -52,7 +52,8 @@ pub fn sort(context: &Context, args: &BenchSort) -> Result<()> {
     let report =
         SortReport { version: env!("CARGO_PKG_VERSION"), device: resolved_device(&args.device), threads: rayon::current_num_threads(), seed: args.seed, cases };
     context.output.result(&report, || {
-        let mut lines = vec![format!("sort on {}, {} threads", report.device, report.threads), "     pairs  bits  median ms   Mpairs/s     GB/s".to_string()];
+        let threads = plural(report.threads, "thread", "threads");
+        let mut lines = vec![format!("sort on {}, {} {threads}", report.device, report.threads), "     pairs  bits  median ms   Mpairs/s     GB/s".to_string()];
         lines.extend(
             report
                 .cases
@@ -110,8 +111,9 @@ pub fn loss(context: &Context, args: &BenchLoss) -> Result<()> {
     let report =
         LossReport { version: env!("CARGO_PKG_VERSION"), device: resolved_device(&args.device), threads: rayon::current_num_threads(), seed: args.seed, cases };
     context.output.result(&report, || {
+        let threads = plural(report.threads, "thread", "threads");
         let mut lines =
-            vec![format!("L1 and SSIM on {}, {} threads", report.device, report.threads), "     image  forward ms  with gradient ms     GB/s".to_string()];
+            vec![format!("L1 and SSIM on {}, {} {threads}", report.device, report.threads), "     image  forward ms  with gradient ms     GB/s".to_string()];
         lines.extend(report.cases.iter().map(|c| {
             format!("{:>5}x{:<5} {:>10.3} {:>17.3} {:>8.2}", c.width, c.height, c.forward.median_ms, c.forward_backward.median_ms, c.gigabytes_per_s)
         }));

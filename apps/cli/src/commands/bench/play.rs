@@ -5,7 +5,7 @@ use crate::args::BenchPlay;
 use crate::commands::Context;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::{Camera, Error, Result};
+use cc4dgs_core::{Camera, Error, Result, plural};
 use cc4dgs_play::player::Player;
 use serde::Serialize;
 
@@ -56,11 +56,12 @@ pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
 fn text(report: &PlayReport) -> String {
     let p = &report.playback;
     format!(
-        "{} on {}, {}, {} threads: {}x{}, {} Gaussians, {} of them moving\n  {:.1} frames/s without waiting; deformer {:.3} ms + rasterizer {:.2} ms (medians, waited for); first frame {:.1} + {:.1} ms",
+        "{} on {}, {}, {} {}: {}x{}, {} Gaussians, {} of them moving\n  {:.1} frames/s without waiting; deformer {:.3} ms + rasterizer {:.2} ms (medians, waited for); first frame {:.1} + {:.1} ms",
         report.model,
         report.scene,
         report.device,
         report.threads,
+        plural(report.threads, "thread", "threads"),
         report.width,
         report.height,
         report.gaussians,

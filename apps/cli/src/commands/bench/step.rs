@@ -4,7 +4,7 @@ use super::scene_cases;
 use crate::args::BenchStep;
 use crate::commands::Context;
 use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, synthetic_scene, time_step};
-use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device, resolved_device};
+use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device, plural, resolved_device};
 use serde::Serialize;
 
 #[derive(Serialize)]
@@ -51,7 +51,8 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
 }
 
 fn text(report: &StepReport) -> String {
-    let mut lines = vec![format!("training step on {}, {} threads, {} repeats", report.device, report.threads, report.repeats)];
+    let [threads, repeats] = [plural(report.threads, "thread", "threads"), plural(report.repeats, "repeat", "repeats")];
+    let mut lines = vec![format!("training step on {}, {} {threads}, {} {repeats}", report.device, report.threads, report.repeats)];
     lines.push("workload        image  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
     lines.extend(report.cases.iter().map(|c| {
         // Devices that do not read their counters back have no pairs to show.

@@ -7,7 +7,7 @@ use crate::args::{SchedulerArg, SweepCollect, SweepEmit, SweepPlan, SweepRun};
 use crate::ignored::{Stated, refuse_ignored, written};
 use crate::interrupt;
 use cc4dgs::plugins;
-use cc4dgs_core::{Error, Result, config};
+use cc4dgs_core::{Error, Result, config, plural};
 use cc4dgs_train::sweep::{
     Busy, Collection, EmitOptions, Grid, Outcome, Plan, Scheduler, SweepFolder, Tables, TrainingState, Worker, collect as collect_results, emit as emit_file,
     run_training, select, summary, write_tables,
@@ -55,7 +55,9 @@ pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
             Some(folder) => format!("run it: {} sweep run {}", program(), word(folder)),
             None => "nothing was written; --out DIR writes the plan".into(),
         };
-        format!("{}: {} trainings, {} cells ({} of them finished){time}\n{next}", report.name, report.trainings, report.cells, report.finished)
+        let [trainings, cells] = [plural(report.trainings, "training", "trainings"), plural(report.cells, "cell", "cells")];
+        let (name, finished) = (&report.name, report.finished);
+        format!("{name}: {} {trainings}, {} {cells} ({finished} of them finished){time}\n{next}", report.trainings, report.cells)
     })
 }
 

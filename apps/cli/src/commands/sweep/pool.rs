@@ -3,7 +3,7 @@
 use super::BUSY;
 use crate::commands::Context;
 use crate::interrupt;
-use cc4dgs_core::{Error, Event, EventSink, Result};
+use cc4dgs_core::{Error, Event, EventSink, Result, plural};
 use cc4dgs_train::sweep::{Failure, INTERRUPTED, Plan, SweepFolder};
 use serde::Serialize;
 use std::collections::{BTreeSet, VecDeque};
@@ -83,7 +83,8 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     let report = PoolReport { finished: pool.finished(), planned: plan.cells.len(), seconds: began.elapsed().as_secs_f64() };
     context.output.result(&report, || {
         let root = super::word(&folder.root().to_string_lossy());
-        format!("{} of {} cells are finished; tables: {} sweep collect {root}", report.finished, report.planned, super::program())
+        let (finished, are) = (report.finished, plural(report.finished, "is", "are"));
+        format!("{finished} of {} cells {are} finished; tables: {} sweep collect {root}", report.planned, super::program())
     })
 }
 
@@ -92,7 +93,8 @@ impl Pool<'_> {
     fn work(&mut self, jobs: usize, stop: &AtomicBool) -> Result<()> {
         loop {
             if stop.load(Ordering::Relaxed) {
-                let text = format!("{} of {} cells are finished; the next run does the others", self.finished(), self.plan.cells.len());
+                let (finished, planned) = (self.finished(), self.plan.cells.len());
+                let text = format!("{finished} of {planned} cells {} finished; the next run does the others", plural(finished, "is", "are"));
                 return Err(Error::Interrupted(text));
             }
             while self.running.len() < jobs && Instant::now() >= self.not_before {
@@ -199,7 +201,8 @@ impl Pool<'_> {
     /// Trainings done and the time that the others will take.
     fn left(&mut self, jobs: usize) -> String {
         let waiting = self.queue.len() + self.running.len();
-        let text = format!("{} of {} cells, {waiting} trainings left", self.finished(), self.plan.cells.len());
+        let trainings = plural(waiting, "training", "trainings");
+        let text = format!("{} of {} cells, {waiting} {trainings} left", self.finished(), self.plan.cells.len());
         if waiting == 0 || self.seconds.is_empty() {
             return text;
         }

@@ -19,7 +19,7 @@ mod neighbours;
 
 use super::{Finding, Severity, Subject, listed};
 use crate::sample::spread;
-use cc4dgs_core::{Result, Scene, Split};
+use cc4dgs_core::{Result, Scene, Split, plural};
 use glam::DVec3;
 use matching::{Look, Tally};
 use neighbours::{Stand, neighbours};
@@ -151,8 +151,9 @@ impl Comparison {
             return None;
         }
         let found = format!(
-            "{misfits} of {} pairs of neighbouring cameras do not see common content where their poses say ({:.0} % of the matches lie on epipolar lines, chance is 20 %)",
+            "{misfits} of {} pairs of neighbouring cameras {} common content where their poses say ({:.0} % of the matches lie on epipolar lines, chance is 20 %)",
             judged.len(),
+            plural(misfits, "does not see", "do not see"),
             100.0 * all.share()
         );
         if share >= REFUSE_ALL && all.share() < ALL_WRONG {
@@ -168,8 +169,12 @@ impl Comparison {
         let rest_fits = rest.iter().filter(|fits| !**fits).count() as f64 <= DOUBT * rest.len() as f64;
         if !outliers.is_empty() && outliers.len() * 3 <= self.looks.len() && rest_fits {
             let names: Vec<String> = outliers.iter().map(|&index| scene.camera(self.views[index]).name.clone()).collect();
-            let problem = format!("the poses of {} cameras do not fit those of their neighbours: {}", names.len(), listed(&names));
-            return Some(Finding::doubt(Subject::Poses, problem, "Correct these poses or leave the images out"));
+            let problem = match names.as_slice() {
+                [name] => format!("the pose of the camera {name} does not fit those of its neighbours"),
+                _ => format!("the poses of {} cameras do not fit those of their neighbours: {}", names.len(), listed(&names)),
+            };
+            let remedy = plural(names.len(), "Correct this pose or leave the image out", "Correct these poses or leave the images out");
+            return Some(Finding::doubt(Subject::Poses, problem, remedy));
         }
         let severity = if share >= REFUSE_PART && judged.len() >= LEAST_PAIRS_OF_PART { Severity::Refuse } else { Severity::Doubt };
         let problem = format!("{found}: a part of the cameras has other units, another origin or wrong poses");

@@ -21,7 +21,7 @@ pub(crate) use size::limit_sizes_to;
 pub use size::{limit_opacities, limit_sizes};
 
 use crate::config::InitSource;
-use cc4dgs_core::{Error, PointCloud, Result, Scene, Seed};
+use cc4dgs_core::{Error, PointCloud, Result, Scene, Seed, plural};
 use choose::{Arrangement, Choice};
 use fuse::Fused;
 use glam::Vec3;
@@ -86,7 +86,8 @@ impl FoundPoints {
             (self.random, "random in what the cameras see"),
         ];
         let list: Vec<String> = kinds.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("{n} {what}")).collect();
-        format!("{} points: {}", self.cloud.positions.len(), list.join(", "))
+        let count = self.cloud.positions.len();
+        format!("{count} {}: {}", plural(count, "point", "points"), list.join(", "))
     }
     fn add(&mut self, points: &[Candidate]) -> usize {
         self.cloud.positions.extend(points.iter().map(|c| c.position.to_array()));
@@ -148,7 +149,7 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
     if source == InitSource::Photo && groups[0].len() + groups[2].len() < FEWEST.min(count) {
         return Err(Error::data(
             format!("scene {}", scene.name),
-            format!("only {} points match in several views", groups[0].len()),
+            format!("only {} {} in several views", groups[0].len(), plural(groups[0].len(), "point matches", "points match")),
             "Check the calibration and the order of the cameras, or start from random points",
         ));
     }

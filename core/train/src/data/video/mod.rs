@@ -12,7 +12,7 @@ pub(super) use probe::{VideoFacts, probe};
 use timeline::timeline;
 
 use cc4dgs_core::reader::files::{file_name, has_extension};
-use cc4dgs_core::{Error, ImageSource, Limits, Result, SceneOptions, Seed};
+use cc4dgs_core::{Error, ImageSource, Limits, Result, SceneOptions, Seed, plural};
 use std::ffi::{OsStr, OsString};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -69,10 +69,11 @@ fn of_two_moments(names: &[String], facts: &[VideoFacts]) -> Option<String> {
     let first = interlaced.first()?;
     let stem = Path::new(first).file_stem().unwrap_or_default().to_string_lossy();
     Some(format!(
-        "interlaced frames in {} of {} videos ({first}{}): the odd and the even rows of a frame show different moments, so what moves has combed edges. \
+        "interlaced frames in {} of {} {} ({first}{}): the odd and the even rows of a frame show different moments, so what moves has combed edges. \
          Deinterlace each (ffmpeg -i {first} -vf yadif -c:v libx264 -crf 12 OTHER_FOLDER/{stem}.mp4) and put the new files in their place",
         interlaced.len(),
         names.len(),
+        plural(names.len(), "video", "videos"),
         if interlaced.len() > 1 { " and others" } else { "" }
     ))
 }

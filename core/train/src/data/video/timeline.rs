@@ -4,6 +4,8 @@
 //! timestamp is nearest, and none where the nearest is over half an interval away: an image at the wrong time is worse than no image. For videos of one
 //! constant rate that start together, frame k is frame k of the file.
 
+use cc4dgs_core::plural;
+
 /// Of the interval: how far past the end of the shortest video the last instant may lie, against rounding.
 const SLACK: f64 = 0.25;
 /// Rates that differ by less than this share are called equal.
@@ -80,7 +82,7 @@ pub(super) fn timeline(names: &[String], times: &[&[f64]]) -> Timeline {
         }
     }
     if times.iter().any(|t| t.len() != shortest) && fastest <= slowest * (1.0 + SAME_RATE) {
-        notes.push(format!("the videos have different numbers of frames ({shortest} and more); the {count} that all have are used"));
+        notes.push(format!("the videos have different numbers of frames ({shortest} and more); the {count} that all have {} used", plural(count, "is", "are")));
     }
     Timeline { frames, notes }
 }

@@ -8,7 +8,7 @@ use super::{MAX_COST_DB, Removal, Reset, Standing, recovery};
 use crate::sample::spread_views;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DensityPlan, Event, Gaussians, Result, Scene, Schedule};
+use cc4dgs_core::{DensityPlan, Event, Gaussians, Result, Scene, Schedule, plural};
 use std::sync::Arc;
 
 /// Training views that are rendered to find out.
@@ -116,9 +116,10 @@ impl Context<'_> {
             }
             Standing::Waiting => kept.append(&mut going),
             Standing::Overdue(last) => {
+                let since = schedule.iteration - last.iteration;
                 self.note(format!(
-                    "{psnr_db:.1} dB on training views {} iterations after Gaussians were removed, {:.1} dB before: removals are put off",
-                    schedule.iteration - last.iteration,
+                    "{psnr_db:.1} dB on training views {since} {} after Gaussians were removed, {:.1} dB before: removals are put off",
+                    plural(since, "iteration", "iterations"),
                     last.psnr_db
                 ));
                 state.guard.removal = Some(Removal { reported: true, ..last });
@@ -165,10 +166,10 @@ impl Context<'_> {
         if now >= reset.psnr_db - MAX_COST_DB {
             return Ok(());
         }
+        let since = schedule.iteration - reset.iteration;
         let message = format!(
-            "{:.1} dB on training views {} iterations after the opacity reset, {:.1} dB before it: the opacities return, and the stage has no more resets",
-            now,
-            schedule.iteration - reset.iteration,
+            "{now:.1} dB on training views {since} {} after the opacity reset, {:.1} dB before it: the opacities return, and the stage has no more resets",
+            plural(since, "iteration", "iterations"),
             reset.psnr_db
         );
         self.note(message);

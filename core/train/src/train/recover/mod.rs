@@ -13,7 +13,7 @@ use crate::masks::blur;
 use crate::sample::spread_views;
 use blobs::blobs;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage};
+use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage, plural};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use glam::DVec3;
@@ -74,10 +74,14 @@ impl Context<'_> {
         let lives = state.deformer.as_ref().is_some_and(|deformer| own_lives(deformer) > 0);
         let too_few = !lives && (explained.len() as f64) < LEAST_EXPLAINED * sightings.len() as f64;
         let message = format!(
-            "{} compact regions of {} training views are not drawn; {} tracks of things that move go through {} of them{}",
+            "{} compact {} of {} training {} {} not drawn; {} {} through {} of them{}",
             sightings.len(),
+            plural(sightings.len(), "region", "regions"),
             lost.len(),
+            plural(lost.len(), "view", "views"),
+            plural(sightings.len(), "is", "are"),
             tracks.len(),
+            plural(tracks.len(), "track of things that move goes", "tracks of things that move go"),
             explained.len(),
             if too_few { ": too few, nothing is added" } else { "" }
         );

@@ -10,7 +10,7 @@ use crate::commands::Context;
 use crate::models::load_model;
 use burn::tensor::Device;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, split_kind};
+use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, plural, split_kind};
 use cc4dgs_play::player::Player;
 use frames::{FrameBench, FrameRow};
 use serde::Serialize;
@@ -165,10 +165,9 @@ fn digest<'v>(values: impl IntoIterator<Item = &'v f32>) -> u64 {
 }
 
 fn text(report: &SkipReport) -> String {
-    let mut lines = vec![format!(
-        "{} on {}, {}, {} threads: {}x{}, {} Gaussians, {} of them moving",
-        report.model, report.scene, report.device, report.threads, report.image_size[0], report.image_size[1], report.gaussians, report.dynamic_gaussians
-    )];
+    let on = format!("{} on {}, {}, {} {}", report.model, report.scene, report.device, report.threads, plural(report.threads, "thread", "threads"));
+    let [width, height] = report.image_size;
+    let mut lines = vec![format!("{on}: {width}x{height}, {} Gaussians, {} of them moving", report.gaussians, report.dynamic_gaussians)];
     let bits = |same: bool| if same { "the same" } else { "others" };
     let title = "a frame without";
     lines.push(format!("{title:<32} deform ms raster ms  frame ms  ratio  first ms  total ms  peak MB difference  bits"));
@@ -179,7 +178,7 @@ fn text(report: &SkipReport) -> String {
         format!("{:<32}{later} {:>6.2} {whole} {peak:>8} {:>10.2e}  {}", r.off, r.ratio, r.largest_difference, bits(r.same_bits))
     }));
     if !report.steps.is_empty() {
-        let title = format!("{} iterations without", report.iterations);
+        let title = format!("{} {} without", report.iterations, plural(report.iterations, "iteration", "iterations"));
         lines.push(format!("{title:<32} {:>12} {:>6} {:>8}  bits of the Gaussians", "ms per view", "ratio", "PSNR dB"));
         lines.extend(
             report.steps.iter().map(|r| format!("{:<32} {:>12.2} {:>6.2} {:>8.2}  {}", r.off, r.ms_per_view.median_ms, r.ratio, r.psnr_db, bits(r.same_bits))),
