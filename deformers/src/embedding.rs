@@ -33,8 +33,9 @@ smooth_weight = 1.0      # weight of the differences between vectors of neighbou
 smooth_neighbours = 20   # the nearest Gaussians that count as neighbours
 smooth_falloff = 2000.0  # differences count exp(-smooth_falloff d^2 / 2) at distance d (published: 2000, d in units of the dataset; here in world units)
 gaussian_lr = 2.5e-3     # Adam on the vectors of Gaussians
-lr_start = 1.6e-4        # Adam on everything else, times the extent of the cameras in the normalised frame, log-linear to lr_end
+lr_start = 1.6e-4        # Adam on everything else, log-linear to lr_end
 lr_end = 1.6e-5
+times_extent = true      # multiply these two rates by the extent of the cameras in the normalised frame, as published
 "#;
 
 /// Shares `fade_in` after which opacity, colour and scale begin to fade in.
@@ -65,6 +66,7 @@ struct Settings {
     gaussian_lr: f64,
     lr_start: f64,
     lr_end: f64,
+    times_extent: bool,
 }
 
 impl Default for Settings {
@@ -84,6 +86,7 @@ impl Default for Settings {
             gaussian_lr: 2.5e-3,
             lr_start: 1.6e-4,
             lr_end: 1.6e-5,
+            times_extent: true,
         }
     }
 }
@@ -239,7 +242,8 @@ impl Deformer for Embedding {
         self.parameters.iter_mut().collect()
     }
     fn groups(&self) -> Vec<ParameterGroup> {
-        vec![ParameterGroup { times_extent: true, ..ParameterGroup::plain("embedding", self.settings.lr_start, self.settings.lr_end) }]
+        let s = &self.settings;
+        vec![ParameterGroup { times_extent: s.times_extent, ..ParameterGroup::plain("embedding", s.lr_start, s.lr_end) }]
     }
 }
 

@@ -28,9 +28,10 @@ half_time = false        # read only the upper half of the time axis, as the pub
 tv_space = 2e-4          # weight of the squared second differences of spatial planes
 tv_time = 1e-3           # the same for planes with time, along time
 time_one = 1e-4          # weight of the distance from 1 of planes with time
-lr_start = 1.6e-4        # Adam on the network, times the extent of the cameras in the normalised frame, log-linear to lr_end
+lr_start = 1.6e-4        # Adam on the network, log-linear to lr_end
 lr_end = 1.6e-5
 grid_rate = 10.0         # learning rate of the planes, as a multiple
+times_extent = true      # multiply the rates by the extent of the cameras in the normalised frame, as published
 "#;
 
 /// The axes of each plane; axis 3 is time.
@@ -56,6 +57,7 @@ struct Settings {
     lr_start: f64,
     lr_end: f64,
     grid_rate: f64,
+    times_extent: bool,
 }
 
 impl Default for Settings {
@@ -74,6 +76,7 @@ impl Default for Settings {
             lr_start: 1.6e-4,
             lr_end: 1.6e-5,
             grid_rate: 10.0,
+            times_extent: true,
         }
     }
 }
@@ -190,7 +193,7 @@ impl Deformer for HexPlane {
     }
     fn groups(&self) -> Vec<ParameterGroup> {
         let s = &self.settings;
-        let group = |name, factor| ParameterGroup { times_extent: true, ..ParameterGroup::plain(name, s.lr_start * factor, s.lr_end * factor) };
+        let group = |name, factor| ParameterGroup { times_extent: s.times_extent, ..ParameterGroup::plain(name, s.lr_start * factor, s.lr_end * factor) };
         vec![group("hexplane net", 1.0), group("hexplane planes", s.grid_rate)]
     }
     /// Smoothness of all planes, and closeness to 1 of planes with time (weights of the published code): squared second differences along a plane's second axis,

@@ -44,6 +44,19 @@ mod tests {
     }
 
     #[test]
+    fn rates_follow_the_extent_of_the_cameras_unless_a_setting_says_otherwise() {
+        let registry = Registry::collect().unwrap();
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(1) };
+        for kind in ["hexplane", "embedding", "swift4d-hash"] {
+            for (settings, follows) in [("", true), ("times_extent = false", false)] {
+                let section: toml::Table = format!("kind = '{kind}'\n{settings}").parse().unwrap();
+                let groups = registry.build_deformer(&section, &context, &Device::flex()).unwrap().groups();
+                assert!(!groups.is_empty() && groups.iter().all(|group| group.times_extent == follows), "{kind}: {settings}");
+            }
+        }
+    }
+
+    #[test]
     fn rates_and_weights_that_are_negative_or_no_numbers_are_refused() {
         let registry = Registry::collect().unwrap();
         let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(1) };
@@ -53,7 +66,7 @@ mod tests {
             ("hash-basis", "lr_start lr_end clip_norm sparsity grid_rate"),
             ("hexplane", "lr_start lr_end grid_rate tv_space tv_time time_one"),
             ("grid4d", "lr_start lr_end lr_grid_start lr_grid_end smooth_weight smooth_delta"),
-            ("swift4d-hash", "lr_start lr_end"),
+            ("swift4d-hash", "lr_start lr_end grid_rate"),
             ("embedding", "lr_start lr_end gaussian_lr smooth_weight smooth_falloff"),
             ("deform-mlp", "lr_start lr_end"),
             ("native-4d", "time_lr duration_lr velocity_lr color_lr"),

@@ -2,6 +2,7 @@
 
 use super::stages::slower;
 use super::*;
+use crate::auto::Overlap;
 
 const MACHINE: Machine = Machine { threads: 2, graphics: false, memory: Some(24_000_000_000) };
 
@@ -53,8 +54,12 @@ fn scenes_get_what_they_need_and_no_more() {
     assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
     assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
     let few = chosen(&Facts { cameras: 6, ..facts(Arrangement::Dome) }, MACHINE, 5.0, None);
-    let many = chosen(&Facts { cameras: 27, ..facts(Arrangement::Dome) }, MACHINE, 5.0, None);
-    assert!(value(&few, "density.decay").is_some() && value(&many, "density.decay").is_none());
+    let decay = |cameras: usize, seen_by: Option<usize>| {
+        let overlap = seen_by.map(|cameras| Overlap { compared: 16, cameras, by_three: 0.9, alone: 0.0, apart: Vec::new() });
+        value(&chosen(&Facts { cameras, overlap, ..facts(Arrangement::Dome) }, MACHINE, 5.0, None), "density.decay").and_then(|v| v.as_float())
+    };
+    let cases = [(4, Some(3)), (10, Some(5)), (16, Some(8)), (18, Some(18)), (16, None), (27, Some(12))];
+    assert_eq!(cases.map(|(cameras, seen_by)| decay(cameras, seen_by)), [Some(0.02), Some(0.01), Some(0.01), Some(0.005), Some(0.005), None]);
     assert!(value(&few, "train.dropout").is_some() && value(&dome, "train.dropout").is_none());
     let most = |cameras: usize| value(&chosen(&Facts { cameras, ..facts(Arrangement::Dome) }, MACHINE, 10.0, None), "density.max_gaussians");
     assert_eq!([4, 9, 60].map(most), [6500, 22_000, 37_000].map(|n: i64| Some(n.into())));
@@ -102,7 +107,7 @@ fn images_shrink_to_the_time() {
     assert_eq!(large.reason, "images of 1920x1080 pixels are too many for 10 minutes on this machine");
     let mixed = image_size(&[[320, 180], [1920, 1080], [1920, 1080]], &options, MACHINE, 10.0).unwrap();
     assert_eq!(mixed.settings, large.settings);
-    assert_eq!(mixed.reason, format!("{}; 1 of 3 cameras have smaller ones, which are not enlarged", large.reason));
+    assert_eq!(mixed.reason, format!("{}; 1 of 3 cameras has smaller ones, which are not enlarged", large.reason));
     assert!(image_size(&[[1920, 1080]], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
 }
 
