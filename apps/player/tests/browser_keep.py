@@ -67,8 +67,8 @@ def reloaded(pages):
 
 
 def frames(pages):
-    """A frame goes on as it was where its page is loaded again, of this site or of another; one without storage begins anew, and so does one that its page loads anew."""
-    for name in ("embedding", "abroad", "sandboxed"):
+    """A frame goes on as it was where its page, of this site, is loaded again; one without storage begins anew, and so does one that its page loads anew."""
+    for name in ("embedding", "sandboxed"):
         page = pages.watch(pages.browser.new_page(viewport={"width": 800, "height": 600}))
         page.goto(f"{pages.address}/{name}.html")
         page.frames[1].wait_for_function(LOADED, timeout=PATIENCE_MS)
@@ -94,7 +94,7 @@ def frames(pages):
     # Chromium complains where a page leaves an answer before its end.
     pages.complaints[:] = [c for c in pages.complaints if "net::ERR_" not in c]
     pages.quiet("frames that are loaded again")
-    say("a frame goes on as it was where its page is loaded again, of this site and of another; without storage it begins anew")
+    say("a frame goes on as it was where its page of this site is loaded again; without storage it begins anew")
 
 
 def several(pages):

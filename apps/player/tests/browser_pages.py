@@ -10,8 +10,8 @@ MODEL = "/model.cc4d"
 # A frame of a real scene takes seconds in software.
 PATIENCE_MS = 180000
 HEAD = '<!doctype html><html lang="en"><title>embedding</title><link rel="icon" href="data:,">'
-# Pages with a player in a frame of this site, of another site, and without storage; and with three players of their own.
-FRAME = HEAD + f'<body><p>A page with a player in it.</p><iframe %s src="%sindex.html?src={MODEL}&amp;autoplay" width="480" height="320" style="border: 0"></iframe></body></html>'
+# Pages with a player in a frame of this site, and without storage; and with three players of their own.
+FRAME = HEAD + f'<body><p>A page with a player in it.</p><iframe %s src="index.html?src={MODEL}&amp;autoplay" width="480" height="320" style="border: 0"></iframe></body></html>'
 SEVERAL = HEAD + f"""<link rel="stylesheet" href="player.css"><body><div></div><div></div><div></div><style>body > div {{ height: 180px }}</style><script type="module">import {{ createPlayer }} from "./player.js";
 const src = "{MODEL}", [one, two, three] = document.querySelectorAll("body > div");
 window.players = [await createPlayer(one, {{ src }}), await createPlayer(two, {{ src }}), await createPlayer(three, {{ src, remember: false }})];</script></body></html>"""
@@ -27,8 +27,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
     def do_GET(self):
         path = self.path.split("?")[0]
-        other_site = f"http://localhost:{self.server.server_port}/"
-        embedding = {"/embedding.html": FRAME % ("", ""), "/abroad.html": FRAME % ("", other_site), "/sandboxed.html": FRAME % ('sandbox="allow-scripts"', ""), "/several.html": SEVERAL}
+        embedding = {"/embedding.html": FRAME % "", "/sandboxed.html": FRAME % 'sandbox="allow-scripts"', "/several.html": SEVERAL}
         if path in embedding:
             return self.answer(embedding[path].encode(), 200, {"Content-Type": "text/html; charset=utf-8"})
         if not path.endswith(".cc4d"):

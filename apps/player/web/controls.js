@@ -49,20 +49,15 @@ export function followLink(player) {
     player.dirty = true;
 }
 
-// A frame cannot ask a page of another site whether it was loaded again. It restores what it kept less than so many milliseconds ago.
-const FRAME_MS = 30000;
-
-// This page and those that it is a frame of, the innermost first: when each `began`, in milliseconds, and whether it was loaded `again`. `crossSite` says that the list
-// ends before a page of another site, which does not tell.
+// This page and those of this site that it is a frame of, the innermost first: when each `began`, in milliseconds, and whether it was loaded `again`.
 const around = [];
-let crossSite = false;
 try {
     for (let page = window, inner = null; page !== inner; [page, inner] = [page.parent, page]) {
         // Chromium says "navigate" in a frame of a page that was reloaded.
         const type = page.performance.getEntriesByType("navigation")[0]?.type;
         around.push({ began: page.performance.timeOrigin, again: ["reload", "back_forward"].includes(type) });
     }
-} catch { crossSite = true; }
+} catch { /* A page of another site does not tell. */ }
 
 // Names of the players in this page: several may show the same model.
 const names = new Set();
@@ -86,7 +81,7 @@ export function remember(player, signal) {
         const { settings, flying, gpu, drawnFacts, source, own } = player;
         // The model that was opened last is not the one that a reload opens, unless it is that of the page.
         const view = gpu && drawnFacts && source === own ? { ...player.now, pose: Array.from(gpu.pose) } : null;
-        const state = { settings, flying, view, at: Date.now(), began: around.map(page => page.began) };
+        const state = { settings, flying, view, began: around.map(page => page.began) };
         // Some pages have no storage, such as those in frames with `sandbox`.
         try { sessionStorage.setItem(kept(player), JSON.stringify(state)); } catch (e) { console.debug(e); }
     };
@@ -103,12 +98,10 @@ export function remember(player, signal) {
 export function restore(player) {
     try {
         player.keptAs = register(player);
-        const { settings, flying, view, at, began } = JSON.parse(sessionStorage.getItem(kept(player))) ?? {};
+        const { settings, flying, view, began } = JSON.parse(sessionStorage.getItem(kept(player))) ?? {};
         if (!settings) return null;
         // A page that began at the same time is still the same: it made this player, or its frame, anew.
-        const changed = around.map((page, k) => page.began !== began[k]);
-        const again = around.some((page, k) => page.again && changed[k]) || crossSite && changed[0] && Date.now() - at < FRAME_MS;
-        if (!again) return null;
+        if (!around.some((page, k) => page.again && page.began !== began[k])) return null;
         sessionStorage.removeItem(kept(player));
         for (const name of Object.keys(player.settings)) player.settings[name] = settings[name] ?? player.settings[name];
         player.set("flying", !!flying);
