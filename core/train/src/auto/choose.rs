@@ -61,7 +61,8 @@ const LEAST_KEY_POINTS: f64 = 400.0;
 const ON_THE_SPOT: f32 = 0.37;
 /// Share of the Gaussians that there are at the start; the rest are points of key frames, or grow.
 const AT_START: f64 = 0.6;
-/// Up to this many cameras, Gaussians are dropped. Held-out cameras gained 0.9 dB with 4 (3.1 where opacities fade by 0.02), and up to 1.1 or lost 0.9 with 8; with 10 nothing, with 27 a loss of 0.4.
+/// Up to this many cameras, Gaussians are dropped. Held-out cameras gained 0.9 dB with 4 (3.1 where opacities fade by 0.02), and up to 1.1 or lost 0.9 with 8;
+/// with 10 nothing, with 27 a loss of 0.4.
 const FEW_CAMERAS: usize = 8;
 /// The share of Gaussians that views are drawn without then, at the end.
 const DROPOUT: f64 = 0.2;
