@@ -105,10 +105,12 @@ fn image_error(path: &Path, e: impl std::fmt::Display) -> Error {
     Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Fetch the file again, or remove it from the dataset")
 }
 
-/// The error of an image that is not decoded. Fetching a file of another format again does not help.
+/// The error of an image that is not decoded. Fetching a file of another format again does not help. Formats of which not even the first bytes are known, such as
+/// HEIC, are told by the file's extension.
 fn not_decoded(path: &Path, e: ImageError) -> Error {
+    let is_other = |hint: ImageFormatHint| matches!(hint, ImageFormatHint::Exact(_)) || !has_extension(path, &["png", "jpg", "jpeg"]);
     match &e {
-        ImageError::Unsupported(unsupported) if matches!(unsupported.format_hint(), ImageFormatHint::Exact(_)) => {
+        ImageError::Unsupported(unsupported) if is_other(unsupported.format_hint()) => {
             Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Convert it to PNG or JPEG, the formats that are read")
         }
         _ => image_error(path, &e),
@@ -227,7 +229,12 @@ mod tests {
             let errors = [image_size(&path, &Limits::default()).unwrap_err(), read_png_or_jpeg(&path, &Limits::default()).unwrap_err()];
             errors.map(|e| e.to_string())
         };
-        let others: [(&str, &[u8]); 3] = [("a.webp", b"RIFF\x1a\0\0\0WEBPVP8L"), ("a.bmp", b"BM\x46\0\0\0\0\0"), ("a.tiff", b"II*\0\x08\0\0\0")];
+        let others: [(&str, &[u8]); 4] = [
+            ("a.webp", b"RIFF\x1a\0\0\0WEBPVP8L"),
+            ("a.bmp", b"BM\x46\0\0\0\0\0"),
+            ("a.tiff", b"II*\0\x08\0\0\0"),
+            ("a.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"),
+        ];
         for (name, bytes) in others {
             assert!(of(name, bytes).iter().all(|e| e.contains(name) && e.contains("Convert it to PNG or JPEG")), "{:?}", of(name, bytes));
         }

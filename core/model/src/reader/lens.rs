@@ -12,30 +12,76 @@ pub enum Distortion {
         /// p1, p2.
         tangential: [f64; 2],
     },
+    /// OpenCV's rational model (COLMAP's `FULL_OPENCV`): quotient of two radial polynomials in r^2 .. r^6, and tangential terms.
+    Rational {
+        /// k1..k3.
+        numerator: [f64; 3],
+        /// k4..k6.
+        denominator: [f64; 3],
+        /// p1, p2.
+        tangential: [f64; 2],
+    },
     /// Equidistant fisheye as in OpenCV: polynomial in the angle.
     Fisheye {
         /// k1..k4.
         radial: [f64; 4],
     },
+    /// COLMAP's `THIN_PRISM_FISHEYE`: the polynomial of [`Self::Fisheye`], with tangential and thin-prism terms of the equidistant point.
+    ThinPrismFisheye {
+        /// k1..k4.
+        radial: [f64; 4],
+        /// p1, p2.
+        tangential: [f64; 2],
+        /// sx1, sy1.
+        prism: [f64; 2],
+    },
+    /// COLMAP's `FOV` (Devernay and Faugeras 2001): the distorted radius is atan(2 r tan(omega / 2)) / omega.
+    FieldOfView {
+        /// Field of view of the ideal lens in radians, from -pi to pi. 0 is no distortion.
+        omega: f64,
+    },
+}
+
+/// Smallest |omega| of [`Distortion::FieldOfView`] in radians whose distortion is computed. It changes radii by a share of about omega^2 / 3 of r^2.
+const LEAST_OMEGA: f64 = 1e-6;
+
+/// The radially scaled point (x, y) with Brown's tangential terms.
+fn brown(x: f64, y: f64, scale: f64, [p1, p2]: [f64; 2]) -> (f64, f64) {
+    let r2 = x * x + y * y;
+    (x * scale + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * scale + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
 }
 
 impl Distortion {
+    /// All coefficients of the model.
+    pub fn coefficients(&self) -> Vec<f64> {
+        match self {
+            Self::None => Vec::new(),
+            Self::Brown { radial, tangential } => [&radial[..], tangential].concat(),
+            Self::Rational { numerator, denominator, tangential } => [&numerator[..], denominator, tangential].concat(),
+            Self::Fisheye { radial } => radial.to_vec(),
+            Self::ThinPrismFisheye { radial, tangential, prism } => [&radial[..], tangential, prism].concat(),
+            Self::FieldOfView { omega } => vec![*omega],
+        }
+    }
     /// Whether there is no distortion.
     pub fn is_identity(&self) -> bool {
-        match self {
-            Self::None => true,
-            Self::Brown { radial, tangential } => radial.iter().chain(tangential).all(|&k| k == 0.0),
-            Self::Fisheye { .. } => false,
-        }
+        !self.is_fisheye() && self.coefficients().iter().all(|&k| k == 0.0)
+    }
+    /// Whether the model is a polynomial in the angle. Without coefficients it is no pinhole.
+    fn is_fisheye(&self) -> bool {
+        matches!(self, Self::Fisheye { .. } | Self::ThinPrismFisheye { .. })
     }
     /// The distorted point of the undistorted point (x, y).
     pub fn distort(&self, x: f64, y: f64) -> (f64, f64) {
         match self {
             Self::None => (x, y),
-            Self::Brown { radial: [k1, k2, k3, k4], tangential: [p1, p2] } => {
+            Self::Brown { radial: [k1, k2, k3, k4], tangential } => {
                 let r2 = x * x + y * y;
-                let f = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
-                (x * f + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * f + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
+                brown(x, y, 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))), *tangential)
+            }
+            Self::Rational { numerator: [k1, k2, k3], denominator: [k4, k5, k6], tangential } => {
+                let r2 = x * x + y * y;
+                brown(x, y, (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))), *tangential)
             }
             Self::Fisheye { radial: [k1, k2, k3, k4] } => {
                 let r = x.hypot(y);
@@ -47,15 +93,36 @@ impl Distortion {
                 let f = t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r;
                 (x * f, y * f)
             }
+            Self::ThinPrismFisheye { radial, tangential, prism: [sx1, sy1] } => {
+                let (x, y) = Self::Fisheye { radial: [0.0; 4] }.distort(x, y);
+                let (u, v) = Self::Brown { radial: *radial, tangential: *tangential }.distort(x, y);
+                let r2 = x * x + y * y;
+                (u + sx1 * r2, v + sy1 * r2)
+            }
+            &Self::FieldOfView { omega } => {
+                let r = x.hypot(y);
+                if omega.abs() < LEAST_OMEGA || r < 1e-12 {
+                    return (x, y);
+                }
+                let f = (2.0 * r * (0.5 * omega).tan()).atan() / (r * omega);
+                (x * f, y * f)
+            }
         }
     }
-    /// The undistorted point of the distorted point (x, y), by Newton's method; `None` if there is none.
+    /// The undistorted point of the distorted point (x, y), by Newton's method where there is no closed form; `None` if there is none.
     pub fn undistort(&self, x: f64, y: f64) -> Option<(f64, f64)> {
-        if let Self::Fisheye { .. } = self {
-            // A pinhole image cannot contain angles of 90 degrees or more.
-            if x.hypot(y) >= 0.5 * std::f64::consts::PI * 1.5 {
-                return None;
+        // A pinhole image cannot contain angles of 90 degrees or more.
+        if self.is_fisheye() && x.hypot(y) >= 0.5 * std::f64::consts::PI * 1.5 {
+            return None;
+        }
+        if let Self::FieldOfView { omega } = *self {
+            let r = x.hypot(y);
+            if omega.abs() < LEAST_OMEGA || r < 1e-12 {
+                return Some((x, y));
             }
+            let angle = r * omega;
+            let f = angle.tan() / (2.0 * r * (0.5 * omega).tan());
+            return (angle.abs() < 0.5 * std::f64::consts::PI).then_some((x * f, y * f));
         }
         let (mut u, mut v) = (x, y);
         for _ in 0..50 {
@@ -78,16 +145,14 @@ impl Distortion {
         let (fx, fy) = self.distort(u, v);
         ((fx - x).abs().max((fy - y).abs()) < 1e-6).then_some((u, v))
     }
-    /// The undistorted radius, at most `largest`, up to which the radial mapping increases. Beyond it the polynomial folds back and is not valid.
+    /// The undistorted radius, at most `largest`, up to which the radial mapping increases. Beyond it the mapping folds back or has a pole, and is not valid.
     pub fn fold_radius(&self, largest: f64) -> f64 {
         const STEPS: usize = 512;
+        let radial = self.radial_part();
         let mut before = 0.0;
         for i in 1..=STEPS {
             let r = largest * i as f64 / STEPS as f64;
-            let image = match self {
-                Self::Brown { radial, .. } => Self::Brown { radial: *radial, tangential: [0.0; 2] }.distort(r, 0.0).0,
-                other => other.distort(r, 0.0).0,
-            };
+            let image = radial.distort(r, 0.0).0;
             if image <= before {
                 return largest * (i - 1) as f64 / STEPS as f64;
             }
@@ -95,26 +160,81 @@ impl Distortion {
         }
         largest
     }
+    /// The model without its tangential and thin-prism terms.
+    fn radial_part(&self) -> Self {
+        match self {
+            Self::Brown { radial, .. } => Self::Brown { radial: *radial, tangential: [0.0; 2] },
+            Self::Rational { numerator, denominator, .. } => Self::Rational { numerator: *numerator, denominator: *denominator, tangential: [0.0; 2] },
+            Self::ThinPrismFisheye { radial, .. } => Self::Fisheye { radial: *radial },
+            other => other.clone(),
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const LENSES: [Distortion; 3] = [
+    const RATIONAL: Distortion = Distortion::Rational { numerator: [0.52, -2.71, 1.55], denominator: [0.41, -2.53, 1.48], tangential: [0.0006, -0.0003] };
+    const PRISM: Distortion = Distortion::ThinPrismFisheye { radial: [0.02, -0.01, 0.003, -0.0005], tangential: [0.001, -0.0005], prism: [0.002, -0.003] };
+    const LENSES: [Distortion; 7] = [
         Distortion::Brown { radial: [0.0578421, -0.0805099, 0.0, 0.0], tangential: [-0.000980296, 0.00015575] },
         Distortion::Brown { radial: [-0.28, 0.07, 0.0, 0.0], tangential: [0.001, -0.0005] },
         Distortion::Fisheye { radial: [0.02, -0.01, 0.003, -0.0005] },
+        RATIONAL,
+        PRISM,
+        Distortion::FieldOfView { omega: 0.9 },
+        Distortion::FieldOfView { omega: 1e-9 },
     ];
 
     #[test]
     fn the_inverse_undoes_the_lens() {
         for lens in &LENSES {
-            for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.6, 0.5), (0.0, 0.7)] {
+            for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.6, 0.5), (0.0, 0.7), (0.73, 0.52), (-0.75, -0.52)] {
                 let (xd, yd) = lens.distort(x, y);
                 let (u, v) = lens.undistort(xd, yd).unwrap();
                 assert!((u - x).abs() < 1e-8 && (v - y).abs() < 1e-8, "{lens:?} at ({x}, {y}): ({u}, {v})");
             }
         }
+    }
+
+    /// References: the formulas of COLMAP's `models/opencv.h`, `thin_prism.h` and `fov.h`, evaluated with NumPy.
+    #[test]
+    fn points_are_where_colmap_has_them() {
+        for (lens, near, far) in [
+            (RATIONAL, (0.30321195341352003, -0.20208930227568006), (-0.6564624237121528, 0.4925868177841146)),
+            (PRISM, (0.2885643790276967, -0.192496001163509), (-0.543775730082858, 0.40743343164041984)),
+            (Distortion::FieldOfView { omega: 0.9 }, (0.30988475430807605, -0.20658983620538407), (-0.5848793773892991, 0.43865953304197425)),
+        ] {
+            for ((x, y), (u, v)) in [((0.3, -0.2), near), ((-0.64, 0.48), far)] {
+                let (a, b) = lens.distort(x, y);
+                assert!((a - u).abs() < 1e-12 && (b - v).abs() < 1e-12, "{lens:?} at ({x}, {y}): ({a}, {b}), not ({u}, {v})");
+            }
+        }
+    }
+
+    #[test]
+    fn lenses_that_fold_or_have_a_pole_end_there() {
+        let rational = |numerator: [f64; 3], denominator: [f64; 3]| Distortion::Rational { numerator, denominator, tangential: [0.1; 2] };
+        // r (1 - r^2) is largest at r = 1 / sqrt(3); r / (1 - 4 r^2) has a pole at r = 1/2.
+        for (lens, end) in [
+            (rational([-1.0, 0.0, 0.0], [0.0; 3]), 1.0 / 3f64.sqrt()),
+            (rational([0.0; 3], [-4.0, 0.0, 0.0]), 0.5),
+            (Distortion::ThinPrismFisheye { radial: [-1.0, 0.0, 0.0, 0.0], tangential: [0.1; 2], prism: [0.1; 2] }, (1.0 / 3f64.sqrt()).tan()),
+        ] {
+            let found = lens.fold_radius(1.0);
+            assert!((found - end).abs() < 0.005, "{lens:?} ends at {found}, not {end}");
+        }
+        assert_eq!(Distortion::FieldOfView { omega: 0.9 }.fold_radius(1.0), 1.0);
+        // A distorted radius of 90 degrees or more over omega shows nothing in front of the camera.
+        assert_eq!(Distortion::FieldOfView { omega: 1.0 }.undistort(1.6, 0.0), None);
+    }
+
+    #[test]
+    fn lenses_without_coefficients_are_pinholes_unless_they_are_fisheyes() {
+        assert!(Distortion::Rational { numerator: [0.0; 3], denominator: [0.0; 3], tangential: [0.0; 2] }.is_identity());
+        assert!(Distortion::FieldOfView { omega: 0.0 }.is_identity() && Distortion::None.is_identity());
+        assert!(!Distortion::ThinPrismFisheye { radial: [0.0; 4], tangential: [0.0; 2], prism: [0.0; 2] }.is_identity());
+        assert!(!Distortion::Rational { numerator: [0.0; 3], denominator: [0.0, 0.0, 0.1], tangential: [0.0; 2] }.is_identity());
     }
 }

@@ -1,26 +1,18 @@
-//! COLMAP models, text or binary, with their sparse points. Every eighth image is held out. Scenes are static, unless each image has a video of its name.
+//! COLMAP models, text or binary, with their sparse points. Every eighth image is held out. Scenes are static, unless each image has a video of its name or of
+//! that of its folder.
 
 use super::assemble::fit_to_image;
+use super::colmap_camera::ColmapCamera;
+use super::colmap_videos::videos;
 use super::masks::warn_of_mask_folder;
 use super::nerfstudio::{HOLD_OUT_EVERY, LEAST_HELD_OUT, NOTHING_HELD_OUT, file_named};
-use super::video::{self, Footage};
 use super::{colmap_binary, colmap_text};
-use cc4dgs_core::reader::files::{file_name, list, read_bytes, read_text};
+use cc4dgs_core::reader::files::{file_name, read_bytes, read_text};
 use cc4dgs_core::reader::pose::{Matrix4, from_quaternion};
-use cc4dgs_core::{
-    Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural,
-};
+use cc4dgs_core::{Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural};
 use glam::DVec3;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-
-/// A camera record: model, size in pixels, parameters.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct ColmapCamera {
-    pub model: Model,
-    pub size: [u64; 2],
-    pub parameters: Vec<f64>,
-}
 
 /// An image record.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,65 +22,6 @@ pub(crate) struct ColmapImage {
     /// Quaternion (w,x,y,z), world to camera.
     pub rotation: [f64; 4],
     pub translation: [f64; 3],
-}
-
-/// The camera models this reader knows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Model {
-    SimplePinhole,
-    Pinhole,
-    SimpleRadial,
-    Radial,
-    OpenCv,
-    OpenCvFisheye,
-    SimpleRadialFisheye,
-    RadialFisheye,
-}
-
-impl Model {
-    const ALL: [(Model, &'static str, i32, usize); 8] = [
-        (Model::SimplePinhole, "SIMPLE_PINHOLE", 0, 3),
-        (Model::Pinhole, "PINHOLE", 1, 4),
-        (Model::SimpleRadial, "SIMPLE_RADIAL", 2, 4),
-        (Model::Radial, "RADIAL", 3, 5),
-        (Model::OpenCv, "OPENCV", 4, 8),
-        (Model::OpenCvFisheye, "OPENCV_FISHEYE", 5, 8),
-        (Model::SimpleRadialFisheye, "SIMPLE_RADIAL_FISHEYE", 8, 4),
-        (Model::RadialFisheye, "RADIAL_FISHEYE", 9, 5),
-    ];
-    /// By COLMAP's number.
-    pub(crate) fn from_id(id: i32) -> Option<Self> {
-        Self::ALL.iter().find(|m| m.2 == id).map(|m| m.0)
-    }
-    /// By COLMAP's name.
-    pub(crate) fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.iter().find(|m| m.1 == name).map(|m| m.0)
-    }
-    /// How many numbers it has.
-    pub(crate) fn parameters(self) -> usize {
-        Self::ALL.iter().find(|m| m.0 == self).map_or(0, |m| m.3)
-    }
-    pub(crate) fn known() -> String {
-        Self::ALL.iter().map(|m| m.1).collect::<Vec<_>>().join(", ")
-    }
-}
-
-impl ColmapCamera {
-    /// Focal lengths, principal point, lens.
-    fn intrinsics(&self) -> ([f64; 2], [f64; 2], Distortion) {
-        let p = &self.parameters;
-        let brown = |k1: f64, k2: f64, p1: f64, p2: f64| Distortion::Brown { radial: [k1, k2, 0.0, 0.0], tangential: [p1, p2] };
-        match self.model {
-            Model::SimplePinhole => ([p[0]; 2], [p[1], p[2]], Distortion::None),
-            Model::Pinhole => ([p[0], p[1]], [p[2], p[3]], Distortion::None),
-            Model::SimpleRadial => ([p[0]; 2], [p[1], p[2]], brown(p[3], 0.0, 0.0, 0.0)),
-            Model::Radial => ([p[0]; 2], [p[1], p[2]], brown(p[3], p[4], 0.0, 0.0)),
-            Model::OpenCv => ([p[0], p[1]], [p[2], p[3]], brown(p[4], p[5], p[6], p[7])),
-            Model::OpenCvFisheye => ([p[0], p[1]], [p[2], p[3]], Distortion::Fisheye { radial: [p[4], p[5], p[6], p[7]] }),
-            Model::SimpleRadialFisheye => ([p[0]; 2], [p[1], p[2]], Distortion::Fisheye { radial: [p[3], 0.0, 0.0, 0.0] }),
-            Model::RadialFisheye => ([p[0]; 2], [p[1], p[2]], Distortion::Fisheye { radial: [p[3], p[4], 0.0, 0.0] }),
-        }
-    }
 }
 
 /// The folder with `cameras.bin` or `cameras.txt`.
@@ -174,7 +107,7 @@ inventory::submit! {
             schema: "",
             capabilities: &[],
         },
-        looks_for: "sparse/0/cameras.bin or .txt, with images.* beside it and images in images/, or a video of each image's name (COLMAP)",
+        looks_for: "sparse/0/cameras.bin or .txt, with images.* beside it and images in images/, or a video of each image's name or folder (COLMAP)",
         order: 600,
         probe,
         open,
@@ -207,9 +140,10 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     for (index, image) in images.iter().enumerate() {
         let bad = |problem: String| Error::data(format!("{object}: image {}", image.name), problem, "Export the model again");
         let camera = cameras.get(&image.camera).ok_or_else(|| bad(format!("its camera {} is not in the model", image.camera)))?;
-        let (focal, principal, distortion) = camera.intrinsics();
+        let named = format!("{object}: camera {}", image.camera);
+        let (focal, principal, distortion) = camera.intrinsics(&named)?;
         let size = camera.size.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
-        limits.check_pixels(&format!("{object}: camera {}", image.camera), camera.size[0], camera.size[1])?;
+        limits.check_pixels(&named, camera.size[0], camera.size[1])?;
         let world_to_camera: Matrix4 = from_quaternion(image.rotation, image.translation).map_err(bad)?;
         let mut camera = RawCamera { name: image.name.clone(), size, focal, principal, distortion, world_to_camera };
         let split = if hold_out && index % HOLD_OUT_EVERY == 0 { Split::Test } else { Split::Train };
@@ -225,75 +159,6 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, image: source });
     }
     Ok(scene)
-}
-
-/// The footage of the images, in their order. Empty unless each image has a video.
-fn videos(path: &Path, images: &[ColmapImage], options: &SceneOptions, limits: &Limits, warnings: &mut Vec<String>) -> Result<Vec<Footage>> {
-    video::footage(&video_files(path, images, warnings)?, options, limits, warnings)
-}
-
-/// Whether there is a file that is not hidden.
-fn is_shown(path: &Path) -> bool {
-    path.is_file() && !file_name(path).starts_with('.')
-}
-
-/// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, in the folder of the project or in its `videos/`, also where `path` is the folder of a
-/// model in `sparse/`. Empty unless each image has one of its own. Hidden files do not count.
-fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) -> Result<Vec<PathBuf>> {
-    let project = project_folder(path);
-    let own = (project != path).then(|| [path.join("videos"), path.to_path_buf()]);
-    let folders: Vec<PathBuf> = [project.join("videos"), project].into_iter().chain(own.into_iter().flatten()).filter(|f| f.is_dir()).collect();
-    let stem = |file: &Path| file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-    let mut by_stem: BTreeMap<String, PathBuf> = BTreeMap::new();
-    let mut pairs = Vec::new();
-    // Of two videos of one name, that beside the model counts.
-    for folder in &folders {
-        for file in list(folder, |p| video::is_video(p) && is_shown(p))? {
-            let other = by_stem.insert(stem(&file), file.clone());
-            pairs.extend(other.map(|other| format!("{} and {}", other.display(), file.display())));
-        }
-    }
-    if let Some(first) = pairs.first() {
-        let more = if pairs.len() > 1 { ", …" } else { "" };
-        warnings.push(format!("of {} {} of videos of one name the second is used: {first}{more}", pairs.len(), plural(pairs.len(), "pair", "pairs")));
-    }
-    if by_stem.is_empty() {
-        let stems: BTreeSet<String> = images.iter().map(|image| stem(Path::new(&image.name))).collect();
-        for folder in folders.iter().filter(|f| f.ends_with("videos")) {
-            let unknown = list(folder, |p| is_shown(p) && stems.contains(&stem(p)))?;
-            if let Some(first) = unknown.first() {
-                warnings.push(format!(
-                    "{} {} in {} {} ({}): the known endings are {}",
-                    unknown.len(),
-                    plural(unknown.len(), "file", "files"),
-                    folder.display(),
-                    plural(unknown.len(), "is not read as a video", "are not read as videos"),
-                    file_name(first),
-                    video::ENDINGS.join(", ")
-                ));
-            }
-        }
-    }
-    let available = by_stem.len();
-    let of = |image: &ColmapImage| by_stem.remove(Path::new(&image.name).file_stem()?.to_str()?);
-    let found: Vec<Option<PathBuf>> = images.iter().map(of).collect();
-    if let Some(lacking) = found.iter().position(Option::is_none) {
-        if available > 0 {
-            let (count, name) = (found.iter().filter(|f| f.is_none()).count(), &images[lacking].name);
-            let have = plural(count, "has no video of its name", "have no video of their name");
-            let problem = format!("{count} of {} images {have} ({name})", images.len());
-            let videos = plural(available, "video is", "videos are");
-            warnings.push(format!("{problem}: the {available} {videos} not used, and the scene is read as one instant"));
-        }
-        return Ok(Vec::new());
-    }
-    if !by_stem.is_empty() {
-        let names = by_stem.values().take(3).map(|file| file_name(file)).collect::<Vec<_>>().join(", ");
-        let more = if by_stem.len() > 3 { ", …" } else { "" };
-        let (count, [are, their]) = (by_stem.len(), [plural(by_stem.len(), "is", "are"), plural(by_stem.len(), "its", "their")]);
-        warnings.push(format!("{count} of {available} videos {are} not used, since the COLMAP model has no image of {their} name: {names}{more}"));
-    }
-    Ok(found.into_iter().flatten().collect())
 }
 
 /// The points of a COLMAP model beside another calibration, if both use the same world: every camera must have an image of its name whose
@@ -317,71 +182,4 @@ pub(crate) fn points_in_same_world(path: &Path, cameras: &[RawCamera], limits: &
 
 fn center(m: &Matrix4) -> DVec3 {
     DVec3::from(std::array::from_fn::<f64, 3, _>(|j| -(0..3).map(|i| m[i][j] * m[i][3]).sum::<f64>()))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn image(name: &str) -> ColmapImage {
-        ColmapImage { camera: 1, name: name.into(), rotation: [1.0, 0.0, 0.0, 0.0], translation: [0.0; 3] }
-    }
-
-    #[test]
-    fn videos_have_any_usual_ending_and_others_are_told() {
-        let dir = tempfile::tempdir().unwrap();
-        let videos = dir.path().join("videos");
-        std::fs::create_dir(&videos).unwrap();
-        let film = |name: &str| std::fs::write(videos.join(name), "").unwrap();
-        let found = || {
-            let mut warnings = Vec::new();
-            let files = video_files(dir.path(), &[image("c0.png")], &mut warnings).unwrap();
-            (files.iter().map(|file| file_name(file)).collect::<Vec<_>>(), warnings.join("\n"))
-        };
-        film("c0.braw");
-        let (files, said) = found();
-        assert!(files.is_empty() && said.contains("is not read as a video (c0.braw)") && said.contains("m2ts"), "{files:?} {said}");
-        for name in ["c0.MTS", "c0.m2ts", "c0.MP4", "c0.mov", "c0.mkv", "c0.avi", "c0.webm"] {
-            film(name);
-            assert_eq!(found(), (vec![name.to_string()], String::new()));
-            std::fs::remove_file(videos.join(name)).unwrap();
-        }
-        film("c0.MTS");
-        film("c0.mp4");
-        let (files, said) = found();
-        assert!(files == ["c0.mp4"] && said.contains("of 1 pair of videos of one name") && said.contains("c0.MTS and "), "{files:?} {said}");
-    }
-
-    #[test]
-    fn videos_are_those_of_the_project_and_those_without_an_image_are_told() {
-        let dir = tempfile::tempdir().unwrap();
-        let model = dir.path().join("sparse/1");
-        std::fs::create_dir_all(&model).unwrap();
-        std::fs::create_dir(dir.path().join("videos")).unwrap();
-        std::fs::write(model.join("cameras.bin"), "").unwrap();
-        let film = |name: &str| std::fs::write(dir.path().join("videos").join(name), "").unwrap();
-        for name in ["c0.mp4", "c1.MOV", "._c0.mp4"] {
-            film(name);
-        }
-        let images = ["c0.png", "c1.png"].map(image);
-        let found = |path: &Path| {
-            let mut warnings = Vec::new();
-            let files = video_files(path, &images, &mut warnings).unwrap();
-            assert!(files.iter().all(|file| file.is_file()));
-            (files.iter().map(|file| file_name(file)).collect::<Vec<_>>(), warnings.join("\n"))
-        };
-        let both = vec!["c0.mp4".to_string(), "c1.MOV".to_string()];
-        for path in [dir.path(), model.as_path()] {
-            assert_eq!(found(path), (both.clone(), String::new()));
-        }
-        // COLMAP has not registered the image of this camera.
-        film("c2.mp4");
-        for path in [dir.path(), model.as_path()] {
-            let (files, said) = found(path);
-            assert!(
-                files == both && said.contains("1 of 3 videos is not used, since the COLMAP model has no image of its name") && said.contains("c2.mp4"),
-                "{files:?} {said}"
-            );
-        }
-    }
 }

@@ -1,6 +1,7 @@
 //! COLMAP's binary files. Every count is held against the bytes that are there before anything is allocated for it.
 
-use super::colmap::{ColmapCamera, ColmapImage, Model};
+use super::colmap::ColmapImage;
+use super::colmap_camera::{ColmapCamera, Model};
 use cc4dgs_core::{Error, Limits, RawPoints, Result};
 use std::collections::BTreeMap;
 
@@ -55,26 +56,19 @@ impl<'a> Bytes<'a> {
     }
 }
 
-/// `cameras.bin`.
+/// `cameras.bin`, with cameras of models that are not read: images may use others.
 pub(crate) fn cameras(object: &str, bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>> {
     let mut b = Bytes::new(object, bytes);
     let mut cameras = BTreeMap::new();
     for _ in 0..b.count("cameras", 24)? {
         let id = b.u32()?;
-        let number = b.u32()? as i32;
-        let model = Model::from_id(number).ok_or_else(|| {
-            Error::unsupported(
-                format!("{object}: camera {id}"),
-                format!("camera model number {number}"),
-                format!("Undistort with COLMAP, or use one of {}", Model::known()),
-            )
-        })?;
+        let model = Model::from_number(b.u32()? as i32, &format!("{object}: camera {id}"))?;
         let size = [b.u64()?, b.u64()?];
-        let mut parameters = Vec::with_capacity(model.parameters());
-        for _ in 0..model.parameters() {
+        let mut parameters = Vec::with_capacity(model.parameters);
+        for _ in 0..model.parameters {
             parameters.push(b.floats::<1>()?[0]);
         }
-        cameras.insert(id, ColmapCamera { model, size, parameters });
+        cameras.insert(id, ColmapCamera { model: model.name.to_string(), size, parameters });
     }
     Ok(cameras)
 }
@@ -130,5 +124,27 @@ mod tests {
         assert!(cameras("t", &claim).is_err() && images("t", &claim).is_err() && points("t", &claim, &Limits::default()).is_err());
         let claim = (u64::MAX / 51).to_le_bytes();
         assert!(points("t", &claim, &Limits::default()).is_err());
+    }
+
+    #[test]
+    fn cameras_of_models_that_are_not_read_are_passed_over() {
+        let camera = |id: u32, model: i32, parameters: &[f64]| {
+            let sizes = [64u64, 48].map(u64::to_le_bytes).concat();
+            let numbers: Vec<u8> = parameters.iter().flat_map(|v| v.to_le_bytes()).collect();
+            [&id.to_le_bytes()[..], &model.to_le_bytes(), &sizes[..], &numbers[..]].concat()
+        };
+        let file = |records: &[Vec<u8>]| cameras("t", &[&(records.len() as u64).to_le_bytes()[..], &records.concat()[..]].concat());
+        for (number, name, count) in
+            [(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16), (12, "SIMPLE_DIVISION", 4), (13, "DIVISION", 5), (16, "EUCM", 6), (17, "EQUIRECTANGULAR", 2)]
+        {
+            let found = file(&[camera(7, number, &vec![0.5; count]), camera(8, 15, &[60.0, 61.0, 32.0, 24.0])]).unwrap();
+            assert_eq!(found[&8], ColmapCamera { model: "FISHEYE".into(), size: [64, 48], parameters: vec![60.0, 61.0, 32.0, 24.0] });
+            let message = found[&7].intrinsics("t: camera 7").unwrap_err().to_string();
+            assert!(message.contains(&format!("camera model {name}")) && message.contains("SIMPLE_FISHEYE"), "{message}");
+        }
+        for number in [99, -1] {
+            let message = file(&[camera(7, number, &[0.5; 12])]).unwrap_err().to_string();
+            assert!(message.contains("t: camera 7") && message.contains(&format!("camera model number {number}")), "{message}");
+        }
     }
 }

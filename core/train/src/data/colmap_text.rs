@@ -1,6 +1,7 @@
 //! COLMAP's text files.
 
-use super::colmap::{ColmapCamera, ColmapImage, Model};
+use super::colmap::ColmapImage;
+use super::colmap_camera::{ColmapCamera, Model};
 use cc4dgs_core::{Error, Limits, RawPoints, Result};
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -33,22 +34,16 @@ fn after_words(line: &str, count: usize) -> &str {
     (0..count).fold(line.trim(), |rest, _| rest.split_once(char::is_whitespace).map_or("", |(_, rest)| rest.trim_start()))
 }
 
-/// `cameras.txt`: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[].
+/// `cameras.txt`: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]. Cameras of models that COLMAP does not have come without parameters.
 pub(crate) fn cameras(object: &str, text: &str) -> Result<BTreeMap<u32, ColmapCamera>> {
     let mut cameras = BTreeMap::new();
     for (n, line) in lines(text).filter(|(_, l)| !l.trim().is_empty()) {
         let mut words = line.split_whitespace();
         let id = next(&mut words, object, n)?;
-        let name: String = next(&mut words, object, n)?;
-        let model = Model::from_name(&name).ok_or_else(|| {
-            Error::unsupported(
-                format!("{object}: line {}", n + 1),
-                format!("camera model {name}"),
-                format!("Undistort with COLMAP, or use one of {}", Model::known()),
-            )
-        })?;
+        let model: String = next(&mut words, object, n)?;
         let size = [next(&mut words, object, n)?, next(&mut words, object, n)?];
-        let parameters = (0..model.parameters()).map(|_| next(&mut words, object, n)).collect::<Result<_>>()?;
+        let count = Model::from_name(&model).map_or(0, |model| model.parameters);
+        let parameters = (0..count).map(|_| next(&mut words, object, n)).collect::<Result<_>>()?;
         cameras.insert(id, ColmapCamera { model, size, parameters });
     }
     Ok(cameras)
@@ -114,6 +109,15 @@ mod tests {
         assert_eq!(with("\n").unwrap().len(), 2);
         let message = with("").unwrap_err().to_string();
         assert!(message.contains("line 3") && message.contains("10 values"), "{message}");
+    }
+
+    #[test]
+    fn cameras_of_any_model_are_listed() {
+        let found = cameras("t", "1 PINHOLE 64 48 60 61 32 24\n2 EUCM 64 48 60 61 32 24 0.5 1\n3 OTHER 64 48 1 2\n").unwrap();
+        assert_eq!([1, 2, 3].map(|id| found[&id].parameters.len()), [4, 6, 0]);
+        let message = found[&3].intrinsics("t: camera 3").unwrap_err().to_string();
+        assert!(message.contains("t: camera 3") && message.contains("camera model OTHER"), "{message}");
+        assert!(cameras("t", "1 FULL_OPENCV 64 48 60 61 32 24\n").unwrap_err().to_string().contains("a value is missing"));
     }
 
     #[test]

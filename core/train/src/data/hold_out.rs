@@ -12,7 +12,7 @@ const LEAST_CAMERAS: usize = 4;
 /// `scene` with validation views among its training views; where a reader already named some, they stay the only ones. A function of the scene and `count` alone.
 ///
 /// Where training cameras have several frames, whole cameras are kept out, evenly spread: a camera whose other frames are trained on says nothing of new
-/// viewpoints. Else `count` single images are, evenly spread. With a `count` of 0 nothing changes.
+/// viewpoints. Else `count` single images are, evenly spread over the cameras and the frames of each. With a `count` of 0 nothing changes.
 ///
 /// # Errors
 /// [`Error::Parameter`] where fewer than two training views would be left.
@@ -21,7 +21,7 @@ pub fn hold_out(scene: &Scene, count: usize) -> Result<Scene> {
     if count == 0 || scene.views.iter().any(|view| view.split == Split::Validation) {
         return Ok(rest);
     }
-    let train = scene.split(Split::Train);
+    let mut train = scene.split(Split::Train);
     if count + 2 > train.len() {
         return Err(Error::parameter(
             "train.validation",
@@ -36,6 +36,10 @@ pub fn hold_out(scene: &Scene, count: usize) -> Result<Scene> {
         let kept_out = spread(&filming, filming.len().div_ceil(CAMERAS_PER_VALIDATION));
         kept_out.iter().flat_map(|camera| of_camera[camera].iter().copied()).collect()
     } else {
+        if !filming.is_empty() {
+            // Frame by frame, every n-th view may be of one camera.
+            train.sort_by_key(|&view| (scene.views[view].camera, scene.views[view].frame));
+        }
         spread(&train, count)
     };
     for view in views {
@@ -69,6 +73,12 @@ mod tests {
     fn else_single_images_are() {
         assert_eq!(hold_out(&scene(20, 1), 4).unwrap().split(Split::Validation).len(), 4);
         assert_eq!(hold_out(&scene(2, 10), 3).unwrap().split(Split::Validation).len(), 3);
+        // Of all cameras, although the views go on frame by frame.
+        for (cameras, frames, count) in [(2, 100, 5), (3, 200, 8)] {
+            let rest = hold_out(&scene(cameras, frames), count).unwrap();
+            let of: Vec<usize> = (0..cameras).map(|c| rest.split(Split::Validation).iter().filter(|&&v| rest.views[v].camera == c).count()).collect();
+            assert!(of.iter().sum::<usize>() == count && of.iter().all(|n| *n >= count / cameras), "{of:?}");
+        }
         assert!(hold_out(&scene(20, 1), 0).unwrap().split(Split::Validation).is_empty());
         assert!(hold_out(&scene(5, 1), 4).err().unwrap().to_string().contains("at most 3"));
     }

@@ -7,6 +7,8 @@ use serde::Deserialize;
 
 /// The model of fisheye lenses.
 const FISHEYE: &str = "OPENCV_FISHEYE";
+/// The model whose k4, k5 and k6 are those of a denominator.
+const RATIONAL: &str = "FULL_OPENCV";
 
 /// What a file says of a lens: of all images, or of one.
 #[derive(Clone, Default, Deserialize)]
@@ -23,6 +25,8 @@ pub(crate) struct Intrinsics {
     k2: Option<f64>,
     k3: Option<f64>,
     k4: Option<f64>,
+    k5: Option<f64>,
+    k6: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
     /// nerfstudio's list of k1, k2, k3, k4, p1, p2, which counts in place of those that stand beside it. An empty one states a lens without distortion.
@@ -39,6 +43,9 @@ impl Intrinsics {
         if own.camera_angle_x.or(own.camera_angle_y).is_some() {
             [shared.fl_x, shared.fl_y, shared.camera_angle_x, shared.camera_angle_y] = [None; 4];
         }
+        if own.fl_x.or(own.fl_y).is_some() {
+            [shared.camera_angle_x, shared.camera_angle_y] = [None; 2];
+        }
         if own.camera_model.is_some() {
             shared.is_fisheye = None;
         }
@@ -48,7 +55,7 @@ impl Intrinsics {
         macro_rules! first {
             ($($field:ident),*) => { Self { $($field: own.$field.or(shared.$field)),* } };
         }
-        first!(camera_angle_x, camera_angle_y, fl_x, fl_y, cx, cy, w, h, k1, k2, k3, k4, p1, p2, distortion_params, camera_model, is_fisheye)
+        first!(camera_angle_x, camera_angle_y, fl_x, fl_y, cx, cy, w, h, k1, k2, k3, k4, k5, k6, p1, p2, distortion_params, camera_model, is_fisheye)
     }
     /// With the coefficients of the list by their names. A list of another length stays as it is, and [`Self::distortion`] refuses it.
     fn with_names(&self) -> Self {
@@ -58,19 +65,30 @@ impl Intrinsics {
             _ => return self.clone(),
         };
         let [k1, k2, k3, k4, p1, p2] = list.map(Some);
-        Self { k1, k2, k3, k4, p1, p2, ..self.clone() }
+        let [k5, k6] = if self.distortion_params.as_ref().is_some_and(Vec::is_empty) { [Some(0.0); 2] } else { [self.k5, self.k6] };
+        Self { k1, k2, k3, k4, k5, k6, p1, p2, ..self.clone() }
     }
     fn distortion(&self) -> Result<Distortion, String> {
         let radial = [self.k1, self.k2, self.k3, self.k4].map(|k| k.unwrap_or(0.0));
         let tangential = [self.p1.unwrap_or(0.0), self.p2.unwrap_or(0.0)];
+        let ([k1, k2, k3, k4], [k5, k6]) = (radial, [self.k5, self.k6].map(|k| k.unwrap_or(0.0)));
         let distortion = match self.camera_model.as_deref().unwrap_or("OPENCV") {
             FISHEYE => Distortion::Fisheye { radial },
             _ if self.is_fisheye == Some(true) => Distortion::Fisheye { radial },
+            RATIONAL => Distortion::Rational { numerator: [k1, k2, k3], denominator: [k4, k5, k6], tangential },
             "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => Distortion::Brown { radial, tangential },
             other => {
-                return Err(format!("camera model {other:?} is not supported; known are OPENCV, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, {FISHEYE}"));
+                return Err(format!(
+                    "camera model {other:?} is not supported; known are OPENCV, {RATIONAL}, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, {FISHEYE}"
+                ));
             }
         };
+        if !matches!(distortion, Distortion::Rational { .. }) && (k5 != 0.0 || k6 != 0.0) {
+            return Err(format!(
+                "k5 is {k5} and k6 is {k6}, which only {RATIONAL} has: state this camera_model if k4, k5 and k6 are those of the denominator, as in OpenCV, \
+                 or else undistort the images"
+            ));
+        }
         match self.distortion_params.as_ref().map(Vec::len).filter(|count| !matches!(count, 0 | 6)) {
             Some(count) => Err(format!("distortion_params has {count} numbers, not the six k1, k2, k3, k4, p1, p2")),
             None => Ok(distortion),
@@ -145,12 +163,28 @@ mod tests {
     }
 
     #[test]
+    fn the_rational_lens_has_six_radial_coefficients() {
+        let named = r#""k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "k5": 0.5, "k6": 0.6, "p1": 0.01, "p2": 0.02"#;
+        let lens = |own: &str, shared: &str| merged(own, shared).distortion();
+        let rational = Distortion::Rational { numerator: [0.1, 0.2, 0.3], denominator: [0.4, 0.5, 0.6], tangential: [0.01, 0.02] };
+        let model = |name: &str| format!(r#"{{"camera_model": "{name}"}}"#);
+        assert_eq!(lens(&model("FULL_OPENCV"), &format!("{{{named}}}")), Ok(rational));
+        for name in ["OPENCV", FISHEYE] {
+            let problem = lens(&model(name), &format!("{{{named}}}")).unwrap_err();
+            assert!(problem.contains("k5 is 0.5 and k6 is 0.6") && problem.contains("FULL_OPENCV"), "{problem}");
+        }
+        assert!(lens(r#"{"k5": 0.0, "k6": 0.0}"#, &format!("{{{named}}}")).is_ok(), "zeros of its own");
+        assert!(lens(r#"{"distortion_params": []}"#, &format!("{{{named}}}")).is_ok(), "a lens without distortion");
+    }
+
+    #[test]
     fn what_an_image_states_in_one_way_displaces_what_is_shared_in_the_other() {
         let focal = |own: &str, shared: &str| merged(own, shared).focal(100.0, 60.0).unwrap().map(|f| (1e6 * f).round() / 1e6);
         let (right_angle, pixels) = (r#"{"camera_angle_x": 1.5707963267948966}"#, r#"{"fl_x": 70, "fl_y": 71}"#);
         assert_eq!(focal(right_angle, pixels), [50.0; 2]);
         assert_eq!(focal(r#"{"camera_angle_y": 1.5707963267948966}"#, pixels), [30.0; 2]);
         assert_eq!(focal(pixels, right_angle), [70.0, 71.0]);
+        assert_eq!(focal(r#"{"fl_x": 80}"#, r#"{"camera_angle_x": 1.5, "camera_angle_y": 1.5}"#), [80.0; 2]);
         assert_eq!(focal(r#"{"fl_x": 80}"#, pixels), [80.0, 71.0]);
         assert_eq!(focal("{}", pixels), [70.0, 71.0]);
         let is_fisheye = |own: &str, shared: &str| matches!(merged(own, shared).distortion().unwrap(), Distortion::Fisheye { .. });

@@ -167,7 +167,7 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
         found.push(Footage { name: stem(&file), size: [w, h], images: frames(vec![file], None, warnings) });
     }
     if found.is_empty() {
-        let remedy = "Put cam00.mp4 …, folders cam00/ … of frames, or images/ beside poses_bounds.npy";
+        let remedy = "Put cam00.mp4 …, folders cam00/ … of PNG or JPEG frames, or images/ with such images beside poses_bounds.npy";
         return Err(Error::data(path.display().to_string(), "no videos, camera folders or images were found", remedy));
     }
     Ok(found)

@@ -22,7 +22,7 @@ pub(crate) const LEAST_HELD_OUT: usize = 3;
 /// What is said of fewer.
 pub(crate) const NOTHING_HELD_OUT: &str = "fewer than three images or cameras: none is held out (scene.test_cameras names some)";
 /// Units of depth per step where the file states none: millimetres, in a world of metres (nerfstudio's data conventions).
-const DEPTH_UNIT: f64 = 1e-3;
+pub(super) const DEPTH_UNIT: f64 = 1e-3;
 
 #[derive(Deserialize)]
 struct Transforms {
@@ -98,11 +98,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let object = file.display().to_string();
     let transforms: Transforms = read_json(&file, limits)?;
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
-    match transforms.ply_file_path.as_ref().map(|named| points(&object, folder, named, limits)).transpose() {
-        Ok(points) => scene.points = points,
-        // The cameras do not need them.
-        Err(error) => scene.warnings.push(format!("the points of ply_file_path are not used: {error}")),
-    }
+    read_points(&object, folder, transforms.ply_file_path.as_deref(), limits, &mut scene);
     let mut frames: Vec<&Frame> = transforms.frames.iter().collect();
     frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let mut videos = videos(&object, &frames, folder, options, limits, &mut scene.warnings)?;
@@ -150,7 +146,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         }
         scene.cameras.push(of_frame(frame, &|| image_size(&path, limits), &bad)?);
         times.push(frame.time);
-        let depth = frame.depth_file_path.as_ref().map(|named| file_named(folder, named)).filter(|f| f.is_file()).map(|path| DepthFile { path, unit });
+        let depth = depth_file(folder, frame.depth_file_path.as_deref(), unit);
         missing_depth += usize::from(frame.depth_file_path.is_some() && depth.is_none());
         let image = ImageSource::File { path, mask: None, depth };
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image });
@@ -159,10 +155,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         let [have, their] = [plural(depth_of_videos, "video has", "videos have"), plural(depth_of_videos, "its", "their")];
         scene.warnings.push(format!("{depth_of_videos} {have} a depth_file_path, which is read for images alone; {their} depth is unknown"));
     }
-    if missing_depth > 0 {
-        let [have, their] = [plural(missing_depth, "image has", "images have"), plural(missing_depth, "its", "their")];
-        scene.warnings.push(format!("{missing_depth} {have} a depth_file_path that names no file; {their} depth is unknown"));
-    }
+    warn_of_missing_depth(missing_depth, &mut scene.warnings);
     if !missing.is_empty() {
         let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         scene.warnings.push(format!(
@@ -198,6 +191,28 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         }
     }
     Ok(scene)
+}
+
+/// Gives `scene` the points of the PLY that the document `object` names, if it names one. A warning says why they are not used.
+pub(super) fn read_points(object: &str, folder: &Path, named: Option<&str>, limits: &Limits, scene: &mut RawScene) {
+    match named.map(|named| points(object, folder, named, limits)).transpose() {
+        Ok(points) => scene.points = points,
+        // The cameras do not need them.
+        Err(error) => scene.warnings.push(format!("the points of ply_file_path are not used: {error}")),
+    }
+}
+
+/// The file of recorded depth that an image names, if there is one; `unit` is in units of the world per step.
+pub(super) fn depth_file(folder: &Path, named: Option<&str>, unit: f64) -> Option<DepthFile> {
+    named.map(|named| file_named(folder, named)).filter(|f| f.is_file()).map(|path| DepthFile { path, unit })
+}
+
+/// Says so where `count` images name a depth file that does not exist.
+pub(super) fn warn_of_missing_depth(count: usize, warnings: &mut Vec<String>) {
+    if count > 0 {
+        let [have, their] = [plural(count, "image has", "images have"), plural(count, "its", "their")];
+        warnings.push(format!("{count} {have} a depth_file_path that names no file; {their} depth is unknown"));
+    }
 }
 
 /// The points of the PLY that the document `object` names.

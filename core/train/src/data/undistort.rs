@@ -21,11 +21,7 @@ impl Undistort {
     /// Plans for images of `size` pixels with the given focal lengths and principal point in pixels; `object` names the camera in errors.
     pub fn plan(object: &str, distortion: &Distortion, size: [u32; 2], focal: [f64; 2], principal: [f64; 2]) -> Result<Self> {
         let bad = |problem: String| Error::data(object, problem, "Check the distortion coefficients, or undistort the images first");
-        let coefficients: Vec<f64> = match distortion {
-            Distortion::None => vec![],
-            Distortion::Brown { radial, tangential } => radial.iter().chain(tangential).copied().collect(),
-            Distortion::Fisheye { radial } => radial.to_vec(),
-        };
+        let coefficients = distortion.coefficients();
         if coefficients.iter().any(|k| !k.is_finite() || k.abs() > 1e4) {
             return Err(bad(format!("distortion coefficients {coefficients:?} are not plausible")));
         }
@@ -130,10 +126,13 @@ fn sample(image: &Image8, u: f64, v: f64, px: &mut [u8]) {
 mod tests {
     use super::*;
 
-    const LENSES: [Distortion; 3] = [
+    const LENSES: [Distortion; 6] = [
         Distortion::Brown { radial: [0.0578421, -0.0805099, 0.0, 0.0], tangential: [-0.000980296, 0.00015575] },
         Distortion::Brown { radial: [-0.28, 0.07, 0.0, 0.0], tangential: [0.001, -0.0005] },
         Distortion::Fisheye { radial: [0.02, -0.01, 0.003, -0.0005] },
+        Distortion::Rational { numerator: [0.52, -2.71, 1.55], denominator: [0.41, -2.53, 1.48], tangential: [0.0006, -0.0003] },
+        Distortion::ThinPrismFisheye { radial: [0.02, -0.01, 0.003, -0.0005], tangential: [0.001, -0.0005], prism: [0.002, -0.003] },
+        Distortion::FieldOfView { omega: 0.6 },
     ];
 
     /// An image whose colours are the ideal coordinates, as the lens would take it, comes back with colours equal to its pinhole coordinates.
@@ -166,6 +165,8 @@ mod tests {
         for k in [f64::NAN, f64::INFINITY, 1e300, -1e5] {
             assert!(Undistort::plan("t", &Distortion::Brown { radial: [k, 0.0, 0.0, 0.0], tangential: [0.0; 2] }, [64, 64], [50.0; 2], [32.0; 2]).is_err());
         }
+        let bent = |omega: f64| Undistort::plan("t", &Distortion::FieldOfView { omega }, [64, 64], [50.0; 2], [32.0; 2]);
+        assert!(bent(std::f64::consts::PI).is_err() && bent(5.0).is_err() && bent(0.8).is_ok());
         // Folds at r = 0.58, inside the image.
         if let Ok(plan) = Undistort::plan("t", &Distortion::Brown { radial: [-1.0, 0.0, 0.0, 0.0], tangential: [0.0; 2] }, [64, 64], [50.0; 2], [32.0; 2]) {
             let half = f64::from(plan.size[0]) / 2.0 / 50.0;

@@ -173,7 +173,10 @@ fn llff_with_videos() {
         path.to_string_lossy().into_owned()
     };
     let packets: Vec<String> = (0..6).map(|t| format!("{{\"pts_time\": \"{}.0\", \"flags\": \"K_\"}}", t)).collect();
-    let facts = format!("{{\"packets\": [{}], \"streams\": [{{\"width\": 16, \"height\": 12, \"field_order\": \"ORDER\"}}]}}", packets.join(","));
+    let facts = format!(
+        "{{\"packets\": [{}], \"streams\": [{{\"width\": 16, \"height\": 12, \"field_order\": \"ORDER\", \"color_transfer\": \"smpte2084\"}}]}}",
+        packets.join(",")
+    );
     // The second camera is interlaced.
     script("ffprobe", format!("#!/bin/sh\ncase \"$*\" in *cam01*) order=tt;; *) order=progressive;; esac\necho '{facts}' | sed \"s/ORDER/$order/\"\n"));
     // The last argument is the pattern; the frames the filter selects are 1, 3, 5.
@@ -187,6 +190,9 @@ fn llff_with_videos() {
     let combed: Vec<&String> = scene.warnings.iter().filter(|w| w.contains("interlaced")).collect();
     let parts = ["1 of 2 videos", "(cam01.mp4)", "ffmpeg -i cam01.mp4 -vf yadif", "OTHER_FOLDER/cam01.mp4"];
     assert!(combed.len() == 1 && parts.iter().all(|part| combed[0].contains(part)), "{:?}", scene.warnings);
+    let high: Vec<&String> = scene.warnings.iter().filter(|w| w.contains("high dynamic range")).collect();
+    let parts = ["2 of 2 videos", "(cam00.mp4 and others)", "r=tv,format=yuv420p", "OTHER_FOLDER/cam00.mp4"];
+    assert!(high.len() == 1 && parts.iter().all(|part| high[0].contains(part)), "{:?}", scene.warnings);
     assert!(!log.exists(), "nothing is decoded before a frame is wanted");
     for (view, v) in scene.views.iter().enumerate() {
         assert_eq!(scene.frame(view).unwrap().data[2] as usize, 10 * v.camera + 1 + 2 * v.frame);

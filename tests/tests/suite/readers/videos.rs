@@ -197,6 +197,18 @@ fn variable_rates_are_matched_by_time() {
 }
 
 #[test]
+fn frames_count_whose_container_states_no_times() {
+    if !ffmpeg() {
+        return;
+    }
+    // MPEG program streams state none for some frames where there are B frames.
+    let (dir, options) = rig(2, SIZE);
+    let frames: Vec<usize> = (0..40).collect();
+    (0..2).for_each(|c| record(&dir.path().join(format!("cam{c:02}.mpg")), c, &frames, "25", &["-c:v", "mpeg2video", "-bf", "2"]));
+    assert_eq!(instants(&opened(&dir, &options)), (0..40).map(|k| (k, vec![Some(k); 2])).collect());
+}
+
+#[test]
 fn different_rates_are_brought_to_the_lowest() {
     if !ffmpeg() {
         return;

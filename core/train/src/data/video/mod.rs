@@ -57,6 +57,7 @@ pub(super) fn footage(videos: &[PathBuf], options: &SceneOptions, limits: &Limit
     let common = timeline(&names, &times);
     warnings.extend(common.notes);
     warnings.extend(of_two_moments(&names, &facts));
+    warnings.extend(of_high_range(&names, &facts));
     let sources = |(video, frames): (&PathBuf, Vec<Option<usize>>)| -> Vec<Option<ImageSource>> {
         frames.into_iter().map(|frame| frame.map(|frame| ImageSource::Video { path: video.clone(), frame })).collect()
     };
@@ -75,6 +76,22 @@ fn of_two_moments(names: &[String], facts: &[VideoFacts]) -> Option<String> {
         names.len(),
         plural(names.len(), "video", "videos"),
         if interlaced.len() > 1 { " and others" } else { "" }
+    ))
+}
+
+/// A warning of the videos with colours of high dynamic range, and what helps; `None` where there are none.
+fn of_high_range(names: &[String], facts: &[VideoFacts]) -> Option<String> {
+    let high: Vec<&str> = names.iter().zip(facts).filter(|(_, facts)| facts.high_range).map(|(name, _)| name.as_str()).collect();
+    let first = high.first()?;
+    let stem = Path::new(first).file_stem().unwrap_or_default().to_string_lossy();
+    Some(format!(
+        "colours of high dynamic range (PQ or HLG) in {} of {} {} ({first}{}): they are taken as they are stored, so images are pale, and differ from those of \
+         other videos. Convert each (ffmpeg -i {first} -vf zscale=t=linear:npl=100,format=gbrpf32le,tonemap=hable:desat=0,zscale=p=bt709:t=bt709:m=bt709:r=tv,\
+         format=yuv420p -c:v libx264 -crf 12 OTHER_FOLDER/{stem}.mp4) and put the new files in their place",
+        high.len(),
+        names.len(),
+        plural(names.len(), "video", "videos"),
+        if high.len() > 1 { " and others" } else { "" }
     ))
 }
 

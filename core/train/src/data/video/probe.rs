@@ -30,6 +30,8 @@ pub(crate) struct VideoFacts {
     pub keys: Vec<bool>,
     /// Whether each frame holds two fields of different moments, every second row of one.
     pub interlaced: bool,
+    /// Whether its colours are those of high dynamic range: PQ or HLG.
+    pub high_range: bool,
 }
 
 /// One of the eight orientations of an image.
@@ -59,6 +61,7 @@ struct Frame {
 #[derive(Deserialize)]
 struct Packet {
     pts_time: Option<String>,
+    dts_time: Option<String>,
     #[serde(default)]
     flags: String,
 }
@@ -72,6 +75,7 @@ struct Stream {
     r_frame_rate: Option<String>,
     avg_frame_rate: Option<String>,
     field_order: Option<String>,
+    color_transfer: Option<String>,
     #[serde(default)]
     side_data_list: Vec<SideData>,
 }
@@ -103,8 +107,8 @@ pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Re
 }
 
 fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFacts> {
-    let entries = "packet=pts_time,flags:stream=width,height,r_frame_rate,avg_frame_rate,field_order:stream_side_data=displaymatrix,rotation";
-    let printed = ask(video, options, &["-show_entries", entries])?;
+    let stream = "stream=width,height,r_frame_rate,avg_frame_rate,field_order,color_transfer:stream_side_data=displaymatrix,rotation";
+    let printed = ask(video, options, &["-show_entries", &format!("packet=pts_time,dts_time,flags:{stream}")])?;
     let bad = |problem: String, remedy: &str| Error::data(format!("video {}", video.display()), problem, remedy);
     let Some(stream) = printed.streams.first() else { return Err(bad("it holds no video".into(), "Check the file")) };
     if !(1..=1 << 16).contains(&stream.width) || !(1..=1 << 16).contains(&stream.height) {
@@ -118,7 +122,8 @@ fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFa
     if times.is_empty() {
         return Err(bad("it has no frame".into(), "Check the video"));
     }
-    Ok(VideoFacts { size: if turn.swaps { [size[1], size[0]] } else { size }, times, keys, interlaced: stream.is_interlaced() })
+    let size = if turn.swaps { [size[1], size[0]] } else { size };
+    Ok(VideoFacts { size, times, keys, interlaced: stream.is_interlaced(), high_range: stream.is_high_range() })
 }
 
 /// How the frames of a video are turned, without listing its packets.
@@ -207,6 +212,10 @@ impl Stream {
     fn is_interlaced(&self) -> bool {
         matches!(self.field_order.as_deref(), Some("tt" | "bb" | "tb" | "bt"))
     }
+    /// Whether its values follow one of the two curves of high dynamic range.
+    fn is_high_range(&self) -> bool {
+        matches!(self.color_transfer.as_deref(), Some("smpte2084" | "arib-std-b67"))
+    }
 }
 
 /// The upper left 2x2 numbers of a display matrix, which ffprobe prints as three numbered lines of three integers.
@@ -233,9 +242,14 @@ fn shown(packets: &[Packet]) -> impl Iterator<Item = &Packet> {
 }
 
 /// Whether packets come before the first key frame, or have no time beside others that have one: in a video that was cut without decoding it, those cannot be decoded.
+///
+/// Some containers (MPEG program streams) state times of presentation for some frames only, all through the video, and of decoding for all: none is missing then.
 fn has_leading(packets: &[Packet]) -> bool {
-    let Some(key) = shown(packets).find(|packet| packet.flags.contains('K')).and_then(|packet| seconds(&packet.pts_time)) else { return false };
-    shown(packets).any(|packet| seconds(&packet.pts_time).is_none_or(|time| time < key))
+    let mut rest = shown(packets).skip_while(|packet| !packet.flags.contains('K'));
+    let Some(key) = rest.next().and_then(|packet| seconds(&packet.pts_time)) else { return false };
+    let is_leading = |packet: &&Packet| seconds(&packet.pts_time).is_none_or(|time| time < key);
+    let is_partly_timed = rest.skip_while(is_leading).any(|packet| seconds(&packet.pts_time).is_none() && seconds(&packet.dts_time).is_some());
+    !is_partly_timed && shown(packets).any(|packet| is_leading(&packet))
 }
 
 /// Times and key frames in the order of presentation, from the time `first` on where one is given. Packets that are only decoded, not shown, are left out.
@@ -282,6 +296,28 @@ mod tests {
         let stream = |order: &str| serde_json::from_str::<Stream>(&format!("{{\"field_order\": \"{order}\"}}")).unwrap().is_interlaced();
         assert!(["tt", "bb", "tb", "bt"].into_iter().all(stream));
         assert!(!stream("progressive") && !stream("unknown") && !serde_json::from_str::<Stream>("{}").unwrap().is_interlaced());
+    }
+
+    #[test]
+    fn only_two_curves_are_of_high_range() {
+        let stream = |transfer: &str| serde_json::from_str::<Stream>(&format!("{{\"color_transfer\": \"{transfer}\"}}")).unwrap().is_high_range();
+        assert!(stream("smpte2084") && stream("arib-std-b67"));
+        assert!(!stream("bt709") && !stream("bt2020-10") && !serde_json::from_str::<Stream>("{}").unwrap().is_high_range());
+    }
+
+    #[test]
+    fn frames_whose_container_states_no_time_of_presentation_count() {
+        // As ffprobe lists MPEG program streams with B frames, in the order of decoding: I P B B P B P.
+        let packets = r#"[{"pts_time":"0.54","dts_time":"0.50","flags":"K_"},{"dts_time":"0.54"},{"pts_time":"0.58","dts_time":"0.58"},
+            {"pts_time":"0.62","dts_time":"0.62"},{"dts_time":"0.66"},{"pts_time":"0.70","dts_time":"0.70"},{"dts_time":"0.74"}]"#;
+        let packets: Vec<Packet> = serde_json::from_str(packets).unwrap();
+        assert!(!has_leading(&packets));
+        let stream: Stream = serde_json::from_str(r#"{"avg_frame_rate":"25/1"}"#).unwrap();
+        assert_eq!(frame_times(&packets, &stream, None).0.len(), 7);
+        // Second fields have neither time, and no frame of their own.
+        let fields: Vec<Packet> = serde_json::from_str(r#"[{"pts_time":"0","flags":"K_"},{},{"pts_time":"0.04"},{}]"#).unwrap();
+        assert!(has_leading(&fields));
+        assert_eq!(frame_times(&fields, &stream, Some(0.0)).0, [0.0, 0.04]);
     }
 
     #[test]
