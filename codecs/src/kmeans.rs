@@ -6,6 +6,8 @@ use rayon::prelude::*;
 
 /// Points per task. Sums are taken within a task and then over tasks in order, so the result does not depend on the number of threads.
 const TASK: usize = 2048;
+/// Numbers that the sums of tasks take together, unless one task per thread takes more: 128 MiB.
+const SUMS: usize = 1 << 24;
 /// Centres compared per SIMD block.
 const LANES: usize = 16;
 
@@ -72,23 +74,24 @@ pub fn assign(points: &[f32], width: usize, centers: &[f32]) -> Assignment {
 /// One Lloyd update: the mean of each centre's points. A centre without points moves to the point farthest from its own.
 pub fn update(points: &[f32], width: usize, assignment: &Assignment, centers: &[f32]) -> Vec<f32> {
     let k = centers.len() / width;
-    let partial: Vec<(Vec<f64>, Vec<u64>)> = points
-        .par_chunks(TASK * width)
-        .zip(assignment.labels.par_chunks(TASK))
-        .map(|(points, labels)| {
-            let (mut sums, mut counts) = (vec![0.0f64; k * width], vec![0u64; k]);
-            for (point, &label) in points.chunks_exact(width).zip(labels) {
-                let at = label as usize * width;
-                counts[label as usize] += 1;
-                sums[at..at + width].iter_mut().zip(point).for_each(|(s, &x)| *s += f64::from(x));
-            }
-            (sums, counts)
-        })
-        .collect();
+    let task = |(points, labels): (&[f32], &[u32])| {
+        let (mut sums, mut counts) = (vec![0.0f64; k * width], vec![0u64; k]);
+        for (point, &label) in points.chunks_exact(width).zip(labels) {
+            let at = label as usize * width;
+            counts[label as usize] += 1;
+            sums[at..at + width].iter_mut().zip(point).for_each(|(s, &x)| *s += f64::from(x));
+        }
+        (sums, counts)
+    };
     let (mut sums, mut counts) = (vec![0.0f64; k * width], vec![0u64; k]);
-    for (s, c) in &partial {
-        sums.iter_mut().zip(s).for_each(|(a, b)| *a += b);
-        counts.iter_mut().zip(c).for_each(|(a, b)| *a += b);
+    // A task has sums of all centres, so only some tasks run before they are added up. The order of the additions does not depend on how many.
+    let rows = TASK * tasks_at_once(k * width).min(assignment.labels.len().div_ceil(TASK)).max(1);
+    for (points, labels) in points.chunks(rows * width).zip(assignment.labels.chunks(rows)) {
+        let partial: Vec<(Vec<f64>, Vec<u64>)> = points.par_chunks(TASK * width).zip(labels.par_chunks(TASK)).map(&task).collect();
+        for (s, c) in &partial {
+            sums.iter_mut().zip(s).for_each(|(a, b)| *a += b);
+            counts.iter_mut().zip(c).for_each(|(a, b)| *a += b);
+        }
     }
     let mut taken: Vec<usize> = Vec::new();
     let mut out = centers.to_vec();
@@ -104,6 +107,11 @@ pub fn update(points: &[f32], width: usize, assignment: &Assignment, centers: &[
         }
     }
     out
+}
+
+/// How many tasks of [`update`] run before their sums, so many numbers each, are added up.
+fn tasks_at_once(numbers: usize) -> usize {
+    rayon::current_num_threads().max(SUMS / numbers.max(1))
 }
 
 /// k-means++: each next centre is a point drawn with probability proportional to its squared distance from the centres so far.

@@ -35,7 +35,7 @@ impl Exporter for Gltf {
         still::sentence(facts, &parts)
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
-        let gaussians = still::instant(source, "glTF")?;
+        let gaussians = still::instant(source, "glTF", 1)?;
         still::write(path, &to_glb(&gaussians, source.facts().up)?)?;
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree.min(HIGHEST_DEGREE), frames: 1, notes: Vec::new() })
     }

@@ -27,7 +27,7 @@ impl Exporter for Ply {
         still::sentence(facts, &[(true, "background"), (!self.dynamic, "dynamic scores"), still::highest_degree(facts)])
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
-        let gaussians = still::with_rotations(still::instant(source, "PLY")?);
+        let gaussians = still::with_rotations(still::instant(source, "PLY", 1)?);
         still::write(path, &to_bytes_with(&gaussians, &PlyOptions { dynamic: self.dynamic, antialiased: source.facts().antialiased })?)?;
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: 1, notes: Vec::new() })
     }

@@ -40,9 +40,11 @@ impl Exporter for Spz {
         still::sentence(facts, &[(true, "background"), (true, "dynamic scores"), (true, "all but 8 bits of colours, opacities and scales"), four])
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
-        let gaussians = still::instant(source, "SPZ")?;
+        let gaussians = still::instant(source, "SPZ", 2)?;
         let options = SpzOptions { antialiased: source.facts().antialiased, ..self.options() };
-        still::write(path, &to_spz(&gaussians, &options)?)?;
+        let file = to_spz(&gaussians, &options)?;
+        source.progress(2, 2)?;
+        still::write(path, &file)?;
         let notes = [vec![format!("SPZ version {}", self.version)], remarks(&gaussians, &options)].concat();
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: 1, notes })
     }

@@ -5,12 +5,12 @@ use std::path::Path;
 
 pub use cc4dgs_format::gaussians::unit_quaternion as unit;
 
-/// The Gaussians of the instant that is asked for, refused where they are invalid.
-pub fn instant(source: &mut dyn ExportSource, format: &str) -> Result<HostGaussians> {
+/// The Gaussians of the instant that is asked for, refused where they are invalid: the first of so many `steps`.
+pub fn instant(source: &mut dyn ExportSource, format: &str, steps: usize) -> Result<HostGaussians> {
     let time = source.facts().time_norm;
     let gaussians = source.gaussians(time)?;
     check(&gaussians, format)?;
-    source.progress(1, 1)?;
+    source.progress(1, steps)?;
     Ok(gaussians)
 }
 

@@ -1,7 +1,46 @@
 //! Every exporter of this crate with the conformance suite.
 
 use cc4dgs_exporters::web::{PAGE_FILES, PAGE_VERSION};
-use cc4dgs_format::{Entries, ExporterPlugin, HostGaussians, config, conformance};
+use cc4dgs_format::playback::MaxError;
+use cc4dgs_format::{Entries, Error, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Result, config, conformance};
+
+/// A model whose export is interrupted once it has told so much progress.
+struct Interrupted {
+    model: conformance::MovingModel,
+    left: usize,
+}
+
+impl ExportSource for Interrupted {
+    fn facts(&self) -> &ExportFacts {
+        self.model.facts()
+    }
+    fn gaussians(&mut self, time_norm: Option<f32>) -> Result<HostGaussians> {
+        self.model.gaussians(time_norm)
+    }
+    fn image(&mut self, index: usize) -> Result<Image8> {
+        self.model.image(index)
+    }
+    fn playable(&mut self, max_error: MaxError, baked: bool) -> Result<Vec<u8>> {
+        self.model.playable(max_error, baked)
+    }
+    fn progress(&mut self, _: usize, _: usize) -> Result<()> {
+        self.left = self.left.checked_sub(1).ok_or_else(|| Error::Interrupted("by the test".into()))?;
+        Ok(())
+    }
+}
+
+#[test]
+fn an_interruption_while_a_file_is_encoded_leaves_none() {
+    let exporters = Entries::<ExporterPlugin>::collect().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["spz", "sog"] {
+        let exporter = (exporters.get(name).unwrap().build)(&toml::Table::new()).unwrap();
+        let path = folder.path().join(name);
+        let written = |left: usize| exporter.write(&mut Interrupted { model: conformance::MovingModel::new(30, 1), left }, &path);
+        assert!(matches!(written(1), Err(Error::Interrupted(_))) && !path.exists(), "{name}");
+        assert!(written(2).is_ok() && path.exists(), "{name}");
+    }
+}
 
 #[test]
 fn every_exporter_conforms() {

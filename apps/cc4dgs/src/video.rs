@@ -1,6 +1,7 @@
 //! Videos through the `ffmpeg` command.
 
-use cc4dgs_core::{Error, Image8, Result};
+use cc4dgs_core::archive::behind_links;
+use cc4dgs_core::{Camera, Error, Image8, Result};
 use std::io::Write;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -35,18 +36,31 @@ fn pattern(frames: &Path) -> PathBuf {
     folder.join("frame_%05d.png")
 }
 
+/// Refuses images of several sizes for the video that `object` names; `shots` are their cameras and times.
+///
+/// # Errors
+/// [`Error::Parameter`] that names two of the sizes.
+pub fn check_sizes(object: &str, shots: &[(Camera, f32)]) -> Result<()> {
+    let mut sizes = shots.iter().map(|(camera, _)| [camera.width, camera.height]);
+    let first = sizes.next();
+    let Some(([w, h], [width, height])) = first.zip(sizes.find(|size| Some(*size) != first)) else { return Ok(()) };
+    let problem = format!("there are images of {w}x{h} and of {width}x{height} pixels, and those of a video have one size");
+    Err(Error::parameter(object, problem, "Give all images one size (--size), or leave the video out"))
+}
+
 /// Makes the video `out` of the first `count` images in `frames`, named by [`frame_name`], at `fps` images per second; it appears complete or not at all.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a rate outside [`RATES`], [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] with its last message where it fails,
 /// [`Error::Io`] for a folder that cannot be written.
 pub fn encode(frames: &Path, count: usize, fps: f64, out: &Path) -> Result<()> {
-    let (rate, part) = (rate(fps)?, temporary(out)?);
+    let (rate, out) = (rate(fps)?, behind_links(out)?);
+    let part = temporary(&out)?;
     let mut command = ffmpeg();
     command.args(["-framerate", &rate, "-start_number", "0", "-i"]).arg(pattern(frames)).args(["-frames:v", &count.to_string()]);
     let output = command.args(CODEC).arg(&part).stdin(Stdio::null()).output().map_err(absent)?;
     check(&output)?;
-    part.persist(out).map_err(|e| Error::io(out, e.error))
+    part.persist(&out).map_err(|e| Error::io(&out, e.error))
 }
 
 /// `fps` as ffmpeg reads it, exactly: rates such as 29.97 are no whole numbers.
@@ -91,6 +105,8 @@ pub struct VideoWriter {
 struct Running {
     ffmpeg: Child,
     part: Option<tempfile::TempPath>,
+    /// The name of the video, behind links.
+    out: PathBuf,
     size: (u32, u32),
 }
 
@@ -146,10 +162,11 @@ impl VideoWriter {
         };
         drop(running.ffmpeg.stdin.take());
         running.ended()?;
-        running.part.take().map_or(Ok(()), |part| part.persist(&self.out)).map_err(|e| Error::io(&self.out, e.error))
+        running.part.take().map_or(Ok(()), |part| part.persist(&running.out)).map_err(|e| Error::io(&running.out, e.error))
     }
     fn start(&self, (width, height): (u32, u32)) -> Result<Running> {
-        let (rate, part) = (rate(self.fps)?, temporary(&self.out)?);
+        let (rate, out) = (rate(self.fps)?, behind_links(&self.out)?);
+        let part = temporary(&out)?;
         let mut command = ffmpeg();
         command.args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &format!("{width}x{height}")]);
         command.args(["-framerate", &rate, "-i", "-"]).args(CODEC);
@@ -157,7 +174,7 @@ impl VideoWriter {
             command.args(["-crf", &crf.to_string()]);
         }
         let ffmpeg = command.arg(&part).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(absent)?;
-        Ok(Running { ffmpeg, part: Some(part), size: (width, height) })
+        Ok(Running { ffmpeg, part: Some(part), out, size: (width, height) })
     }
 }
 
@@ -225,6 +242,16 @@ mod tests {
     }
 
     #[test]
+    fn images_of_a_video_have_one_size() {
+        let shots = |sizes: &[(u32, u32)]| -> Vec<(Camera, f32)> {
+            sizes.iter().map(|&size| (Camera::look_at("a", size, 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]), 0.0)).collect()
+        };
+        assert!(check_sizes("--mp4", &[]).is_ok() && check_sizes("--mp4", &shots(&[(80, 60); 3])).is_ok());
+        let message = check_sizes("--mp4", &shots(&[(80, 60), (80, 60), (60, 80)])).unwrap_err().to_string();
+        assert!(message.starts_with("--mp4") && message.contains("80x60 and of 60x80") && message.contains("--size"), "{message}");
+    }
+
+    #[test]
     fn rates_are_handed_on_exactly() {
         for (fps, text) in [(30.0, "30"), (29.97, "29.97"), (23.976, "23.976"), (0.5, "0.5"), (1000.0, "1000")] {
             assert_eq!(rate(fps).unwrap(), text);
@@ -248,5 +275,16 @@ mod tests {
         (0..2).for_each(|index| cc4dgs_train::images::write_png(frames.join(frame_name(index)), &image).unwrap());
         encode(&frames, 2, 5.0, &out).unwrap();
         assert!(out.metadata().unwrap().len() > 100);
+        // A link stays, and the video is where it leads.
+        #[cfg(unix)]
+        {
+            let link = root.path().join("link.mp4");
+            std::os::unix::fs::symlink("a.mp4", &link).unwrap();
+            encode(&frames, 1, 5.0, &link).unwrap();
+            let mut video = VideoWriter::new(&link, 5.0);
+            video.add(&image).unwrap();
+            video.finish().unwrap();
+            assert!(link.is_symlink());
+        }
     }
 }

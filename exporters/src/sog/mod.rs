@@ -50,8 +50,10 @@ impl Exporter for Sog {
         still::sentence(facts, &parts)
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
-        let gaussians = still::instant(source, "SOG")?;
-        still::write(path, &self.to_bytes(&gaussians, source.facts().antialiased)?)?;
+        let gaussians = still::instant(source, "SOG", 2)?;
+        let file = self.to_bytes(&gaussians, source.facts().antialiased)?;
+        source.progress(2, 2)?;
+        still::write(path, &file)?;
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree.min(HIGHEST_DEGREE), frames: 1, notes: Vec::new() })
     }
 }

@@ -112,6 +112,8 @@ impl Samples {
 fn fit(times: &[f32], instants: &[Instant]) -> (Motion, Instant) {
     let opacities: Vec<f32> = instants.iter().map(|s| s.opacity).collect();
     let (center, width, opacity) = bell(times, &opacities);
+    // Halves, as the file holds them: the curves are fitted to the times that players see.
+    let [center, width] = [center, width].map(|v| half::f16::from_f32(v).to_f32());
     let highest = opacities.iter().fold(1e-9f32, |a, b| a.max(*b));
     let weights: Vec<f64> = opacities.iter().map(|o| UNSEEN + f64::from(o / highest).powi(2)).collect();
     let dts: Vec<f64> = times.iter().map(|t| f64::from(*t) - f64::from(center)).collect();
@@ -267,6 +269,24 @@ mod tests {
             assert!(far < 0.01, "{center} {width} {height} became {c} {w} {h}: {far}");
         }
         assert_eq!(bell(&times, &[0.7; 24]).1, FOREVER);
+    }
+
+    #[test]
+    fn curves_are_fitted_around_the_centre_that_the_file_holds() {
+        let times: Vec<f32> = (0..24).map(|i| i as f32 / 23.0).collect();
+        for peak in [0.53f32, 0.61, 0.7, 0.79, 0.87, 0.96] {
+            let at = |t: &f32| {
+                let opacity = 0.8 * (-((t - peak) / 0.2).powi(2)).exp();
+                Instant { mean: [512.0 * t, 0.0, 0.0], rotation: [1.0, 0.0, 0.0, 0.0], log_scales: [0.0; 3], opacity, color: [0.0; 3] }
+            };
+            let (motion, constant) = fit(&times, &times.iter().map(at).collect::<Vec<Instant>>());
+            let half = |v: f32| half::f16::from_f32(v).to_f32();
+            assert!((motion.center - peak).abs() < 0.01 && motion.width < 0.3, "{motion:?}");
+            // What players see where the Gaussian is seen best, beside where it is: motion is linear, and its coefficient is a half.
+            let seen = constant.mean[0] + motion.powers[0][0] * (peak - half(motion.center));
+            assert!((seen - 512.0 * peak).abs() < 0.02, "{seen} instead of {}", 512.0 * peak);
+            assert_eq!((half(motion.center), half(motion.width)), (motion.center, motion.width));
+        }
     }
 
     #[test]

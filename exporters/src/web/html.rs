@@ -67,10 +67,15 @@ if (location.protocol === "file:") document.getElementById("player").textContent
     "This folder needs a web server: python3 -m http.server. Export with a name that ends in .html for a page that opens from disk.";
 </script>
 <script type="module">
-import {{ createPlayer }} from "./player.js";
+const element = document.getElementById("player");
+const {{ createPlayer }} = await import("./player.js").catch(e => {{
+    if (location.protocol !== "file:") element.textContent =
+        `The player could not be loaded (${{e.message}}). Files of this page are missing or damaged: put player.js, cc4dgs_player.js and all others of its folder beside the page, and reload it.`;
+    throw e;
+}});
 const options = {options};
 options.src = new URLSearchParams(location.search).get("src") ?? options.src;
-window.cc4dgs = await createPlayer(document.getElementById("player"), options);
+window.cc4dgs = await createPlayer(element, options);
 </script>"#
     );
     document(title, r#"<link rel="stylesheet" href="player.css">"#, &body)
@@ -160,6 +165,15 @@ mod tests {
     fn archives_that_no_browser_reads_from_html_are_refused() {
         check_size(400_000_000).unwrap();
         assert!(check_size(403_000_000).unwrap_err().to_string().contains(".html"));
+    }
+
+    #[test]
+    fn a_folder_without_its_player_says_so() {
+        let html = of_folder("t", "model.cc4d", true);
+        let (loads, says) = (html.find("import(\"./player.js\").catch").unwrap(), html.find("could not be loaded (${e.message})").unwrap());
+        assert!(loads < says && html.contains("cc4dgs_player.js and all others of its folder"), "{html}");
+        // The page that build-web copies says the same.
+        assert!(include_str!("../../../apps/player/web/index.html").contains(html[says..].lines().next().unwrap()));
     }
 
     #[test]

@@ -6,7 +6,7 @@
 mod mp4;
 
 use crate::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
-use crate::{Model, Orbit};
+use crate::{Model, Orbit, video};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Presentation, StreamKind};
 use cc4dgs_core::exporter::export;
@@ -100,13 +100,16 @@ impl ExportJob<'_> {
     /// Writes the file or folder; it appears complete or not at all.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for unknown formats, settings and times, for an axis whose length is not 1, for a time where the format holds all of them, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
+    /// [`Error::Parameter`] for unknown formats, settings and times, for an axis whose length is not 1, for a time where the format holds all of them, for images of several sizes where the format holds one, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
     /// cannot hold; what device and disk report.
     pub fn run(&self) -> Result<ExportReport> {
         let plugin = self.registry.exporter(self.format)?;
         let exporter = (plugin.build)(self.settings)?;
         check_time(self.registry, plugin, self.request.time_norm)?;
         self.request.up.map_or(Ok(()), check_up)?;
+        if plugin.info.capabilities.contains(&"one-size") {
+            video::check_sizes(&format!("exporter {}", plugin.info.name), &self.request.shots)?;
+        }
         let mut source = ModelSource::new(self)?;
         let lost = exporter.loses(source.facts());
         let (exported, bytes) = export(exporter.as_ref(), plugin.target, &mut source, self.out, self.overwrite)?;

@@ -58,7 +58,7 @@ inventory::submit! {
             summary: "a video of an orbit or of a dataset's cameras, through ffmpeg",
             paper: "H.264 in MP4 (ISO/IEC 14496)",
             schema: SCHEMA,
-            capabilities: &["images"],
+            capabilities: &["images", "one-size"],
         },
         target: ExportTarget::File("mp4"),
         build,

@@ -30,6 +30,8 @@ pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, MOST_FRAMES, Manif
 pub use packing::{PackedStreams, estimate_stored_len};
 pub use presentation::{MAX_CAMERAS, Presentation};
 pub use read::{Archive, StreamInfo};
+#[cfg(not(target_arch = "wasm32"))]
+pub use write::behind_links;
 pub use write::{ArchiveWriter, write_atomically};
 
 /// First bytes of every archive. The high bit, the line ends and the control character reveal damage by transfers in text mode.

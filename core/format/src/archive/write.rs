@@ -137,8 +137,11 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 /// Where `path` leads: itself, or what is behind symbolic links, whether it exists or not. A rename would put the file in the place of the link.
+///
+/// # Errors
+/// [`Error::Io`] for links that lead in a circle.
 #[cfg(not(target_arch = "wasm32"))]
-fn behind_links(path: &Path) -> Result<std::path::PathBuf> {
+pub fn behind_links(path: &Path) -> Result<std::path::PathBuf> {
     /// As many as Linux follows.
     const MOST_LINKS: usize = 40;
     let mut at = path.to_path_buf();

@@ -6,7 +6,7 @@
 mod target;
 
 #[cfg(not(target_arch = "wasm32"))]
-pub use target::{export, refuse_existing, refuse_other_content};
+pub use target::{check_target, export, refuse_existing, refuse_other_content};
 
 use crate::playback::MaxError;
 use crate::plugin::Plugin;

@@ -2,6 +2,7 @@
 #![cfg(not(target_arch = "wasm32"))]
 
 use super::{ExportSource, ExportTarget, Exported, Exporter};
+use crate::archive::behind_links;
 use crate::{Error, Result};
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -16,11 +17,17 @@ const HEAD_BYTES: u64 = 4096;
 /// [`Error::Parameter`] for a `path` that may not be replaced, [`Error::Io`], and those of [`Exporter::write`].
 pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn ExportSource, path: &Path, overwrite: bool) -> Result<(Exported, u64)> {
     let target = target.at(path);
-    check(path, target, overwrite)?;
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    check_target(path, target, overwrite)?;
     let Some(name) = path.file_name() else {
         return Err(Error::parameter("export", format!("{} is no name to write to", path.display()), "Give the name of the file or folder to write"));
     };
+    // A file behind a link is replaced where it is.
+    let real = match target {
+        ExportTarget::File(_) => behind_links(path)?,
+        _ => path.to_path_buf(),
+    };
+    let path = real.as_path();
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
     let beside = tempfile::Builder::new().prefix(".cc4dgs-").suffix(".part").tempdir_in(folder).map_err(|e| Error::io(folder, e))?;
     let part = beside.path().join(name);
@@ -96,12 +103,18 @@ pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8])
     ))
 }
 
-/// Refuses a `path` that may not be replaced.
-fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
+/// Refuses a `path` that an export may not replace, as [`export`] does. Call it before long work.
+///
+/// # Errors
+/// [`Error::Parameter`], and [`Error::Io`] for a folder that cannot be listed.
+pub fn check_target(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
     let refuse = |problem: &str, remedy: &str| Err(Error::parameter(path.display().to_string(), problem, remedy));
     let Ok(found) = std::fs::symlink_metadata(path) else { return Ok(()) };
-    match target {
-        ExportTarget::File(_) if found.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
+    match target.at(path) {
+        // Also behind a link, where a file would take its place.
+        ExportTarget::File(_) if path.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
+        // A rename would put a file in its place.
+        ExportTarget::File(_) if path.exists() && !path.is_file() => refuse("it is a device or a pipe, and this format is a file", "Give the name of a file"),
         ExportTarget::Folder(_) if !found.is_dir() => refuse("it is a file, and this format is a folder of files", "Give the name of a folder"),
         ExportTarget::Folder(names) => match files(path)?.iter().find(|file| !names.iter().any(|name| is_named(file, name))) {
             Some(other) => {
@@ -201,6 +214,42 @@ mod tests {
         assert!(run("x", false, dir, "deep/many", true).unwrap_err().to_string().contains("notes.md"));
         assert!(run("x", false, file, "deep/many", true).is_err());
         assert!(run("x", false, dir, "deep/one.txt", true).is_err());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_stays_and_its_file_is_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let (real, link) = (folder.path().join("real"), folder.path().join("link.txt"));
+        std::fs::create_dir(&real).unwrap();
+        std::os::unix::fs::symlink("real/one.txt", &link).unwrap();
+        let mut source = Nothing(crate::conformance::export_facts(0, 0));
+        // It leads to nothing yet, then to a file.
+        for text in ["first", "second"] {
+            export(&Text(text, false), ExportTarget::File("txt"), &mut source, &link, true).unwrap();
+            assert!(link.is_symlink() && std::fs::read_to_string(real.join("one.txt")).unwrap() == text);
+        }
+        assert_eq!(std::fs::read_dir(&real).unwrap().count(), 1, "no temporary names are left");
+        // A link to a folder is none to a file, and the folder stays.
+        let folder_link = folder.path().join("folder.txt");
+        std::os::unix::fs::symlink("real", &folder_link).unwrap();
+        let refused = export(&Text("third", false), ExportTarget::File("txt"), &mut source, &folder_link, true).unwrap_err().to_string();
+        assert!(refused.contains("it is a folder") && folder_link.is_symlink() && real.join("one.txt").is_file(), "{refused}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn devices_and_pipes_are_not_replaced_by_files() {
+        use std::os::unix::fs::FileTypeExt;
+        let folder = tempfile::tempdir().unwrap();
+        let (pipe, link) = (folder.path().join("pipe.txt"), folder.path().join("link.txt"));
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        std::os::unix::fs::symlink("pipe.txt", &link).unwrap();
+        let mut source = Nothing(crate::conformance::export_facts(0, 0));
+        for path in [&pipe, &link] {
+            let refused = export(&Text("x", false), ExportTarget::File("txt"), &mut source, path, true).unwrap_err().to_string();
+            assert!(refused.contains("a device or a pipe") && pipe.symlink_metadata().unwrap().file_type().is_fifo(), "{refused}");
+        }
     }
 
     #[test]

@@ -7,6 +7,7 @@ use super::loss::{central_loss, relative_rms};
 use super::mulaw;
 use crate::Result;
 use crate::archive::ByteReader;
+use std::cell::LazyCell;
 
 /// Share of the values at either end that [`encode_within`] may store as escapes.
 const TAIL_WITHIN: f64 = 1e-3;
@@ -64,12 +65,18 @@ pub fn encode(values: &[f32], target: Target) -> Column {
     if let Some(column) = constant(values) {
         return column;
     }
-    let wanted = if target.mu_law {
-        Form::MuLaw { peak: values.iter().fold(0.0, |a, v| a.max(v.abs())), bits: target.bits }
-    } else {
-        uniform(values, target.bits, target.tail)
+    // One for both widths, and none where mu-law is good enough.
+    let found = LazyCell::new(|| range(values, target.tail));
+    let uniform = |bits: u8| {
+        let (low, high) = *found;
+        Form::Uniform { low, high, bits }
     };
-    for form in [wanted, uniform(values, 16, target.tail)] {
+    for first in [true, false] {
+        let form = match (first, target.mu_law) {
+            (true, true) => Form::MuLaw { peak: values.iter().fold(0.0, |a, v| a.max(v.abs())), bits: target.bits },
+            (true, false) => uniform(target.bits),
+            (false, _) => uniform(16),
+        };
         let column = quantise(values, form);
         let decoded = dequantise(&column, values.len());
         if relative_rms(values, &decoded) <= target.loss && central_loss(values, &decoded, 1) <= target.loss {
@@ -84,7 +91,7 @@ pub fn encode_within(values: &[f32], tolerance: f32) -> Column {
     if let Some(column) = constant(values) {
         return column;
     }
-    let Form::Uniform { low, high, .. } = uniform(values, 2, TAIL_WITHIN) else { return quantise(values, Form::Exact) };
+    let (low, high) = range(values, TAIL_WITHIN);
     let steps = (f64::from(high) - f64::from(low)) / (2.0 * f64::from(tolerance));
     let bits = (2..=16u8).find(|&bits| f64::from((1u32 << bits) - 1) >= steps).unwrap_or(16);
     // Rounding to float32 may exceed the tolerance; then one more bit is used.
@@ -110,18 +117,17 @@ fn constant(values: &[f32]) -> Option<Column> {
     values.iter().all(|&v| v == first).then(|| Column { form: Form::Constant(first), codes: Vec::new(), escapes: Vec::new() })
 }
 
-/// A uniform quantiser between the `tail` and 1 - `tail` quantiles, widened by a tenth but never beyond the extremes.
-fn uniform(values: &[f32], bits: u8, tail: f64) -> Form {
-    let mut sorted = values.to_vec();
-    sorted.sort_unstable_by(f32::total_cmp);
-    let last = sorted.len() - 1;
+/// The lowest and highest value of a uniform quantiser of `values` (at least one): the `tail` and 1 - `tail` quantiles, a tenth farther apart but never beyond
+/// the extremes.
+fn range(values: &[f32], tail: f64) -> (f32, f32) {
+    let mut ordered = values.to_vec();
+    let last = ordered.len() - 1;
     // Of few values, up to two at either end may be outliers.
-    let cut = ((tail * sorted.len() as f64) as usize).max(2.min(sorted.len() / 8));
-    let (inner_low, inner_high) = (f64::from(sorted[cut]), f64::from(sorted[last - cut]));
+    let cut = ((tail * ordered.len() as f64) as usize).max(2.min(ordered.len() / 8));
+    // Selecting takes less time than sorting.
+    let [least, inner_low, inner_high, most] = [0, cut, last - cut, last].map(|k| f64::from(*ordered.select_nth_unstable_by(k, f32::total_cmp).1));
     let margin = 0.1 * (inner_high - inner_low);
-    let low = (inner_low - margin).max(f64::from(sorted[0])) as f32;
-    let high = (inner_high + margin).min(f64::from(sorted[last])) as f32;
-    Form::Uniform { low, high, bits }
+    ((inner_low - margin).max(least) as f32, (inner_high + margin).min(most) as f32)
 }
 
 fn quantise(values: &[f32], form: Form) -> Column {
@@ -301,6 +307,20 @@ mod tests {
         let decoded = dequantise(&column, values.len());
         assert_eq!(decoded[77], 1e30);
         assert!(values.iter().zip(&decoded).all(|(a, b)| (a - b).abs() <= 1.1 / 255.0));
+    }
+
+    #[test]
+    fn ranges_are_those_of_sorted_values() {
+        for count in [1usize, 2, 7, 16, 300, 5000] {
+            let values: Vec<f32> = (0..count).map(|i| (i as f32 * 0.37).sin() * if i % 41 == 3 { 1e6 } else { 1.0 }).collect();
+            let mut sorted = values.clone();
+            sorted.sort_unstable_by(f32::total_cmp);
+            let (last, cut) = (count - 1, ((1e-3 * count as f64) as usize).max(2.min(count / 8)));
+            let (low, high) = (f64::from(sorted[cut]), f64::from(sorted[last - cut]));
+            let margin = 0.1 * (high - low);
+            let expected = ((low - margin).max(f64::from(sorted[0])) as f32, (high + margin).min(f64::from(sorted[last])) as f32);
+            assert_eq!(range(&values, 1e-3), expected, "{count} values");
+        }
     }
 
     #[test]
