@@ -112,9 +112,19 @@ pub fn shared_bytes(client: &Client) -> usize {
     (client.properties().hardware.max_shared_memory_size as u64).min(SHARED_CAP.load(Ordering::Relaxed)) as usize
 }
 
+/// Upper bound on the bytes of an array: CubeCL allocates none that is larger than one binding of the adapter.
+pub fn buffer_bytes(client: &Client) -> u64 {
+    client.properties().memory.max_page_size
+}
+
 /// Upper bound on the bytes of one buffer that a kernel may read.
 pub fn binding_bytes(client: &Client) -> u64 {
-    client.properties().memory.max_page_size.min(BINDING_CAP.load(Ordering::Relaxed))
+    indexed(buffer_bytes(client)).min(BINDING_CAP.load(Ordering::Relaxed))
+}
+
+/// `bytes`, or less where that is more words of four bytes than the 32 bits of an index count. CUDA and Vulkan allocate arrays of tens of gigabytes.
+fn indexed(bytes: u64) -> u64 {
+    bytes.min(4 * u64::from(u32::MAX))
 }
 
 /// 0..`rows` in parts of rows of `width` floats that fit one binding. Parts start at multiples of 256 bytes, as bindings must.
@@ -188,4 +198,16 @@ pub fn sum_of_threads(values: &mut Shared<[f32]>, own: f32) -> f32 {
 #[cube]
 pub fn is_finite(value: f32) -> bool {
     (u32::reinterpret(value) & 0x7f80_0000u32) != 0x7f80_0000u32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_of_a_binding_can_be_counted_in_32_bits() {
+        assert_eq!(indexed(128 << 20), 128 << 20);
+        // A quarter of the memory of an H200, which CUDA allocates at once.
+        assert_eq!(indexed(35 << 30) / 4, u64::from(u32::MAX));
+    }
 }

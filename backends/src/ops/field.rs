@@ -197,7 +197,7 @@ impl VoxelCorners {
         if decoder.hash.len() != decoder.shape.input {
             return Err(Error::parameter("decoder", format!("{} hash functions feed {} inputs", decoder.hash.len(), decoder.shape.input), "Make them equal"));
         }
-        check_binding(&weights.device(), "decoder", "vertices", self.vertices.dims()[0], decoder.shape.output * size_of::<f32>())?;
+        check_vertices(&weights.device(), decoder, self.vertices.dims()[0])?;
         Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::decode(weights.into_dispatch(), self.vertices.clone().into_dispatch(), decoder.clone())))
     }
     /// Trilinear interpolation of vertex `features` `[U,F]` at the points `[M,F]`.
@@ -263,6 +263,21 @@ fn check_rows(device: &Device, shape: &ReluShape, rows: usize) -> Result<()> {
 /// An error if an array is more than one binding of the device holds. Processors have no such limit.
 #[cfg(not(feature = "cube"))]
 fn check_rows(_: &Device, _: &ReluShape, _: usize) -> Result<()> {
+    Ok(())
+}
+
+/// An error if an array of the decoder with a row per vertex is more than one binding of `device` holds.
+#[cfg(feature = "cube")]
+fn check_vertices(device: &Device, decoder: &Decoder, vertices: usize) -> Result<()> {
+    let plain = device.clone().without_autodiff();
+    let burn::backend::DispatchDevice::Cube(own) = plain.as_dispatch() else { return Ok(()) };
+    let floats = crate::cube::field::widest_decoder_row(decoder, crate::cube::tensor::shared_bytes(&own.client()));
+    check_binding(device, "decoder", "vertices", vertices, floats * size_of::<f32>())
+}
+
+/// An error if an array is more than one binding of the device holds. Processors have no such limit.
+#[cfg(not(feature = "cube"))]
+fn check_vertices(_: &Device, _: &Decoder, _: usize) -> Result<()> {
     Ok(())
 }
 

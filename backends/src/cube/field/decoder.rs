@@ -159,9 +159,11 @@ fn multiply(layer: &MishLayer, target: Target) -> Step {
     Step::Multiply { source: 0, target, input, output, weights, bias: Some(layer.bias.start), relu: false, add: false }
 }
 
-/// Features `[U, F]` of `vertices` `[U,3]`.
-pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -> CubeTensor {
-    let rows = vertices.meta.shape()[0];
+/// Rows of a plan that is made only to look at its widths.
+const ANY_ROWS: usize = 16;
+
+/// The steps forwards.
+fn forwards(decoder: &Decoder) -> Program {
     let mut steps = Vec::new();
     for layer in decoder.shape.layers() {
         match &layer.gain {
@@ -172,7 +174,23 @@ pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -
             None => steps.push(multiply(&layer, Target::Out(0))),
         }
     }
-    let program = Program(steps);
+    Program(steps)
+}
+
+/// Floats per vertex of the largest array that the kernels bind, forwards or backwards, on a device with so much shared memory.
+pub fn widest_row(decoder: &Decoder, shared_bytes: usize) -> usize {
+    let fits = |program: Program| program.layout(decoder.hash.len(), ANY_ROWS, shared_bytes).is_some();
+    if fits(forwards(decoder)) && fits(plan(&decoder.shape.layers(), ANY_ROWS).program) {
+        return decoder.shape.output;
+    }
+    // Layer by layer, signatures and each layer have an array.
+    decoder.shape.widest()
+}
+
+/// Features `[U, F]` of `vertices` `[U,3]`.
+pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -> CubeTensor {
+    let rows = vertices.meta.shape()[0];
+    let program = forwards(decoder);
     let Some(layout) = program.layout_on(weights, decoder.hash.len(), rows) else { return run(weights, vertices, decoder, rows).output };
     let out = floats(weights, [rows, decoder.shape.output]);
     program.run(layout, Input::Signatures(vertices, &decoder.hash), weights, weights, &out, &(0..rows));
@@ -245,7 +263,7 @@ pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, 
     let gradient = floats(weights, [count]);
     let all: Vec<Dense> = layers.iter().map(dense).collect();
     let both = gradients::with_transposed(weights, &all);
-    for part in parts(weights, rows, plan(&layers, 16).floats.div_ceil(16)) {
+    for part in parts(weights, rows, plan(&layers, ANY_ROWS).floats.div_ceil(ANY_ROWS)) {
         let Plan { program, saved, floats: length } = plan(&layers, part.len());
         let buffer = &floats(weights, [length]);
         program.run(layout, Input::Signatures(vertices, &decoder.hash), &both, grad, buffer, &part);
@@ -300,4 +318,19 @@ fn layer_by_layer(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder
         }
     }
     gradient
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Seed;
+
+    #[test]
+    fn decoders_too_wide_for_the_shared_memory_have_an_array_per_layer() {
+        let widest = |hidden: &[usize], shared_bytes: usize| {
+            let shape = MishShape { input: 128, hidden: hidden.to_vec(), output: 32 };
+            widest_row(&Decoder { hash: LevelHash::new(Seed::root(1), 128, 1000), shape }, shared_bytes)
+        };
+        assert_eq!((widest(&[128, 128], 48 << 10), widest(&[128, 128], 8 << 10), widest(&[4096, 16], 48 << 10)), (32, 128, 4096));
+    }
 }

@@ -8,6 +8,7 @@ mod network;
 mod program;
 mod voxels;
 
+pub use decoder::widest_row as widest_decoder_row;
 pub use gradients::add_segments;
 pub use network::widest_row;
 

@@ -7,7 +7,7 @@ use super::lists::{self, BACKGROUND};
 use super::project::{self, KEYS};
 use super::{DIM, Lists, read_word, rest_width, words};
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{binding_bytes, constant, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for, zeros};
+use crate::cube::tensor::{binding_bytes, buffer_bytes, constant, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for, zeros};
 use crate::ops::rasterize::camera::{CameraConstants, RuleConstants};
 use crate::ops::rasterize::{MAX_TILE_PAIRS, RECORD, RasterSettings, Rasterized, Refusal, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -28,6 +28,13 @@ fn refuse(like: &CubeTensor, refusal: Refusal) -> Rasterized<CubeBackend> {
     }
 }
 
+/// Upper bound on the Gaussians: the widest array that is bound as a whole has at most `binding` bytes, and the coefficients above degree 0, `rest_width` floats per
+/// Gaussian, which are bound in blocks of rows, at most the `buffer` bytes of one allocation.
+fn most_gaussians(binding: u64, buffer: u64, rest_width: usize) -> u64 {
+    let widest = KEYS.max(RECORD).max(SCREEN).max(GEOMETRY) as u64;
+    (binding / (4 * widest)).min(buffer / (4 * rest_width.max(1) as u64))
+}
+
 /// Draws the Gaussians.
 pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> Rasterized<CubeBackend> {
     let SplatTensors { means, scales, quaternions, opacities, colors, sh_rest, background } = super::contiguous(splats);
@@ -41,8 +48,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     let (splats, keys) = (floats(&means, [n, RECORD]), empty(&means, [n, KEYS], DType::U32));
     let radii = empty(&means, [n], DType::I32);
     let raw = settings.space == ParameterSpace::Raw;
-    let widest = KEYS.max(RECORD).max(SCREEN).max(GEOMETRY) as u64;
-    let most = binding_bytes(&client) / (4 * widest);
+    let most = most_gaussians(binding_bytes(&client), buffer_bytes(&client), rest_width(&sh_rest, n));
     if n as u64 > most {
         return refuse(&means, Refusal::Gaussians { found: n as u64, limit: most });
     }
@@ -180,4 +186,19 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     // Counts stay below 2^31, so their bits are those of signed numbers too.
     let pair_count = CubeTensor::new_contiguous(total.client.clone(), total.device.clone(), [1].into(), total.handle.clone(), DType::I32);
     Rasterized { planes, radii, max_weights, work, pair_count, refused: None, saved: Saved::new(saved) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn harmonics_that_no_buffer_holds_bound_the_number_of_gaussians() {
+        let smallest = 128 << 20;
+        // Degree 3 has 15 coefficients above degree 0, in three channels.
+        assert_eq!(most_gaussians(smallest, smallest, 45), smallest / 180);
+        assert_eq!(most_gaussians(smallest, smallest, 0), smallest / (4 * GEOMETRY as u64));
+        // A binding that is smaller than a buffer is no bound for what is bound in blocks of rows.
+        assert_eq!(most_gaussians(smallest, 1 << 40, 45), smallest / (4 * GEOMETRY as u64));
+    }
 }
