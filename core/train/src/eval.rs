@@ -91,9 +91,9 @@ pub struct EvalReport {
     pub split: Split,
     /// Mean over images.
     pub psnr_db: f64,
-    /// Mean over the images that have it, of the pixels that see something move. For a camera with two scored frames or more these are the pixels whose
-    /// temporal deviation is over the training threshold (Swift4D's masks), the same in all frames. For other cameras they are the pixels of the image that
-    /// show a moving object, where the dataset knows them ([`Scene::motion_mask`]: built-in scenes).
+    /// Mean over the images that have it, of the pixels that see something move. For a camera with two frames or more on this side of the split, scored or not,
+    /// these are the pixels whose temporal deviation is over the training threshold (Swift4D's masks), the same in all frames. For other cameras they are the
+    /// pixels of the image that show a moving object, where the dataset knows them ([`Scene::motion_mask`]: built-in scenes).
     pub psnr_dynamic_db: Option<f64>,
     /// Mean over images, Inria's convention.
     pub ssim: f64,

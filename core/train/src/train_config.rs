@@ -171,7 +171,7 @@ pub struct GaussianRates {
     pub sh_rest: f64,
     /// Dynamic scores at the first iteration of their stage.
     pub score: f64,
-    /// Attributes that plug-ins bring along.
+    /// Attributes without a rate of their own. Every deformer states one for each of its attributes, so that this has no effect on them.
     pub extra: f64,
 }
 

@@ -1,7 +1,8 @@
-//! Checkpoints that were damaged: an error, or the same model; never another one. And which settings a run may be given when it goes on.
+//! Checkpoints that were damaged: an error, or the same model; never another one. Which settings a run may be given when it goes on, and what is kept of one
+//! whose images cannot be read any more.
 
 use burn::tensor::{Device, Tensor};
-use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Seed, Silent};
+use cc4dgs_core::{Error, Event, EventSink, FrameSource, HostGaussians, Image8, Limits, PointCloud, Recorder, Registry, Result, Scene, Seed, Silent};
 use cc4dgs_play::Model;
 use cc4dgs_play::checkpoint::{CHECKPOINT, CheckpointArrays, CheckpointFile, FORMAT, read_model};
 use cc4dgs_train::checkpoint::load;
@@ -62,6 +63,68 @@ fn the_length_of_a_main_stage_may_be_set_until_it_is_settled() {
     // A length that was settled at another value is not given up either.
     stopped("stretched", &with("train.stretch=1.4"), 20);
     assert!(resumed("stretched", &sets).unwrap_err().to_string().contains("train.stretch was 1.4 and is 1.0"));
+}
+
+/// The images of a scene, which cannot be read while the flag is set.
+struct Fragile(Arc<Scene>, Arc<AtomicBool>);
+
+impl FrameSource for Fragile {
+    fn load(&self, view: usize) -> Result<Image8> {
+        if self.1.load(Ordering::Relaxed) {
+            return Err(Error::data(format!("image {view}"), "the disk is gone", "Bring it back"));
+        }
+        Ok((*self.0.frame(view)?).clone())
+    }
+}
+
+/// The scene of [`run`] with images that can be lost, none of which is kept, and its settings.
+fn fragile(sets: &[&str], lost: &Arc<AtomicBool>) -> (RunConfig, Scene) {
+    let sets: Vec<String> = ["scene.width=24", "scene.height=24", "init.count=60"].iter().chain(sets).map(ToString::to_string).collect();
+    let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
+    let whole = Arc::new(cc4dgs_train::data::open(Path::new("procedural"), &config.scene, &Registry::collect().unwrap(), &config.limits).unwrap());
+    let source = Arc::new(Fragile(whole.clone(), lost.clone()));
+    let mut scene = Scene::new("fragile", whole.cameras.clone(), whole.views.clone(), source, 0).unwrap();
+    (scene.normalisation, scene.points, scene.background) = (whole.normalisation, whole.points.clone(), whole.background);
+    (config, scene)
+}
+
+#[test]
+fn a_run_whose_images_are_lost_keeps_what_it_learned() {
+    let (folder, registry, never) = (tempfile::tempdir().unwrap(), Registry::collect().unwrap(), AtomicBool::new(false));
+    let lost = Arc::new(AtomicBool::new(false));
+    let (config, scene) = fragile(&["train.iterations=40", "train.log_every=1", "density={kind='none'}"], &lost);
+    let scene = Arc::new(scene);
+    let train = |name: &str, resume: bool, events: &dyn EventSink| {
+        let (out, scene) = (Some(folder.path().join(name)), scene.clone());
+        train(&TrainJob { config: &config, scene, out, resume, registry: &registry, events, stop: &never, observer: None }).map(|(_, report)| report)
+    };
+    let bytes = |name: &str| std::fs::read(folder.path().join(name).join(CHECKPOINT)).unwrap();
+    train("whole", false, &Silent).unwrap();
+    // After iteration 7 of the main stage.
+    let error = train("broken", false, &StopAt(7, &lost)).unwrap_err();
+    assert!(matches!(&error, Error::Data { .. }) && error.to_string().contains("the disk is gone"), "{error}");
+    let heard = Recorder::default();
+    lost.store(false, Ordering::Relaxed);
+    train("broken", true, &heard).unwrap();
+    let iteration_of = |event: Event| if let Event::Iteration { stage, iteration, .. } = event { Some((stage, iteration)) } else { None };
+    let first = heard.events().into_iter().find_map(iteration_of);
+    assert_eq!(first, Some(("main".into(), 8)), "it goes on where the images were lost");
+    assert!(bytes("broken") == bytes("whole"));
+}
+
+#[test]
+fn first_points_that_are_not_finite_are_removed_where_the_main_stage_is_the_only_one() {
+    let (registry, stop) = (Registry::collect().unwrap(), AtomicBool::new(false));
+    for density in ["density={kind='none'}", "density={kind='clone-split'}", "density={kind='mcmc'}"] {
+        let (config, mut scene) = fragile(&["train.iterations=6", "train.shares=[0,0,1]", "train.checks=false", density], &Arc::default());
+        let positions = vec![[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [f32::NAN, 0.0, 0.0], [0.0, 0.5, 0.0]];
+        scene.points = Some(PointCloud { colors: vec![[0.5; 3]; positions.len()], positions });
+        let scene = Arc::new(scene);
+        let job = TrainJob { config: &config, scene, out: None, resume: false, registry: &registry, events: &Silent, stop: &stop, observer: None };
+        let (model, report) = train(&job).unwrap();
+        assert_eq!(report.gaussians, 3, "{density}");
+        assert!(model.gaussians.means.iter().all(|v| v.is_finite()), "{density}");
+    }
 }
 
 #[test]

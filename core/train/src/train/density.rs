@@ -98,6 +98,10 @@ impl Context<'_> {
         if count == 0 || count == broken.len() {
             return Ok(());
         }
+        if !state.guard.counts(broken.len()) {
+            // No stage had an iteration before this one: guard and control know of no Gaussian yet.
+            state.begin_stage(&self.device);
+        }
         let mut plan = DensityPlan::new();
         (0..broken.len()).filter(|&row| !broken[row]).for_each(|row| {
             plan.keep(row);

@@ -72,10 +72,17 @@ impl Context<'_> {
             let every = self.job.config.train.checkpoint_every;
             let saves = every > 0 && schedule.iteration.is_multiple_of(every) && schedule.iteration < self.lengths.length(stage);
             let check = watchdog.checks(schedule.iteration, length, saves);
-            let trouble = match stage {
-                Stage::Score => self.score_step(state, &schedule, check, &mut log)?,
-                _ => self.photometric_step(&schedule, state, &batch, check, &mut log)?,
+            let log_before = log.record();
+            let stepped = match stage {
+                Stage::Score => self.score_step(state, &schedule, check, &mut log),
+                _ => self.photometric_step(&schedule, state, &batch, check, &mut log),
             };
+            if matches!(&stepped, Err(Error::Io { .. } | Error::Data { .. })) {
+                // An image cannot be read: nothing was learned from this iteration.
+                state.record.log = log_before;
+                self.save_before_error(state);
+            }
+            let trouble = stepped?;
             if trouble.is_none() {
                 if stage != Stage::Score {
                     self.control_density(&schedule, state)?;
@@ -189,6 +196,17 @@ impl Context<'_> {
         state.deformer = Some(ModelDeformer { field: simple.field, section, context: deformer.context.clone() });
         state.optimizer.restart("deformer/");
         Ok(())
+    }
+
+    /// Writes the checkpoint of a run that ends because an image cannot be read, as an interruption does. The run's own error counts, whatever becomes of it.
+    fn save_before_error(&self, state: &mut TrainState) {
+        let Some(path) = self.checkpoint.as_ref().filter(|_| state.iteration > 0) else { return };
+        let at = format!("iteration {} of stage {}", state.iteration, state.stage.name());
+        let message = match self.save(state) {
+            Ok(()) => format!("an image cannot be read; everything until {at} is in {}, --resume continues", path.display()),
+            Err(error) => format!("an image cannot be read, and what was learned until {at} is lost: {error}"),
+        };
+        self.job.events.emit(&Event::Warning { object: "training".into(), message });
     }
 
     /// Writes the checkpoint, where the run has a folder.

@@ -108,6 +108,10 @@ impl Guard {
     pub fn begin_stage(&mut self, count: usize) {
         *self = Self { born: vec![0.0; count], drawn: vec![0.0; count], ..Self::default() };
     }
+    /// Whether it counts for so many Gaussians: not before the first stage that has an iteration begins.
+    pub(super) fn counts(&self, gaussians: usize) -> bool {
+        self.born.len() == gaussians
+    }
     /// A training view drew the Gaussians with these radii, 0 where it did not `[N]`. Nothing is read from the device.
     pub(super) fn saw(&mut self, radii: &Tensor<1, Int>) {
         if radii.dims()[0] == self.born.len() {
