@@ -1,6 +1,6 @@
 //! Checking the plug-ins of a configuration before anything long begins.
 
-use cc4dgs_core::{AppearanceContext, DeformerContext, Registry, Result, Seed, parse_device, split_kind};
+use cc4dgs_core::{AppearanceContext, DeformerContext, PosesContext, Registry, Result, Seed, parse_device, split_kind};
 use cc4dgs_train::config::RunConfig;
 
 /// Builds every plug-in of `config` once and drops it. A mistake in the settings of the deformer should not wait for the main stage, nor leave a
@@ -16,6 +16,7 @@ pub fn check(config: &RunConfig, registry: &Registry) -> Result<()> {
     registry.build_deformer(&config.deformer, &context, &device)?;
     registry.build_density(&config.density)?;
     registry.build_appearance(&config.appearance, &AppearanceContext { cameras: 1, seed }, &device)?;
+    registry.build_poses(&config.poses, &PosesContext { cameras: 1, extent: 1.0, seed }, &device)?;
     registry.build_optimizer(&config.optimizer)?;
     for section in config.loss.iter().chain([&config.score_loss]) {
         let (kind, mut settings) = split_kind("loss", section)?;

@@ -19,6 +19,7 @@ pub mod metrics;
 mod module_deformer;
 mod offsets;
 mod optimizer;
+mod poses;
 mod preset;
 mod raster;
 pub mod reader;
@@ -57,6 +58,7 @@ pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};
 pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;
 pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, path_holds, state_array};
+pub use poses::{Posed, Poses, PosesContext, PosesPlugin};
 pub use preset::{PresetPlugin, PresetRole};
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, SplatColors, Splats};
 pub use reader::{

@@ -3,8 +3,8 @@
 use crate::playback::MotionPlugin;
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerLayerPlugin, DeformerPlugin,
-    DensityControl, DensityPlugin, Entries, Error, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer,
-    RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, check_attributes, check_parameters, config, split_kind,
+    DensityControl, DensityPlugin, Entries, Error, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, Poses, PosesContext, PosesPlugin,
+    PresetPlugin, Rasterizer, RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, check_attributes, check_parameters, config, split_kind,
 };
 use burn::tensor::Device;
 
@@ -19,6 +19,7 @@ pub struct Registry {
     density: Entries<DensityPlugin>,
     losses: Entries<LossPlugin>,
     appearances: Entries<AppearancePlugin>,
+    poses: Entries<PosesPlugin>,
     optimizers: Entries<OptimizerPlugin>,
     weight_codecs: Entries<WeightCodecPlugin>,
     readers: Entries<ReaderPlugin>,
@@ -41,6 +42,7 @@ impl Registry {
             density: Entries::collect()?,
             losses: Entries::collect()?,
             appearances: Entries::collect()?,
+            poses: Entries::collect()?,
             optimizers: Entries::collect()?,
             weight_codecs: Entries::collect()?,
             readers: Entries::collect()?,
@@ -51,7 +53,8 @@ impl Registry {
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
         let deformers = self.deformers.facts().chain(self.layers.facts()).chain(self.motions.facts());
         let model = self.codecs.facts().chain(deformers).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts()).chain(self.exporters.facts());
-        let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
+        let cameras = self.appearances.facts().chain(self.poses.facts());
+        let training = self.density.facts().chain(self.losses.facts()).chain(cameras).chain(self.optimizers.facts());
         model.chain(training).chain(self.readers.facts()).chain(self.presets.facts()).collect()
     }
     /// The deformer called `name`.
@@ -90,6 +93,10 @@ impl Registry {
     pub fn appearance(&self, name: &str) -> Result<&'static AppearancePlugin> {
         self.appearances.get(name)
     }
+    /// The pose model called `name`.
+    pub fn poses(&self, name: &str) -> Result<&'static PosesPlugin> {
+        self.poses.get(name)
+    }
     /// The optimizer called `name`.
     pub fn optimizer(&self, name: &str) -> Result<&'static OptimizerPlugin> {
         self.optimizers.get(name)
@@ -108,6 +115,16 @@ impl Registry {
         let appearance = (self.appearance(&kind)?.build)(&settings, context, device)?;
         check_parameters(&format!("appearance {kind}"), &appearance.parameters(), &appearance.groups())?;
         Ok(appearance)
+    }
+    /// Builds the pose model of a `[poses]` section (`kind` and its settings).
+    ///
+    /// # Errors
+    /// As [`Registry::build_appearance`].
+    pub fn build_poses(&self, section: &toml::Table, context: &PosesContext, device: &Device) -> Result<Box<dyn Poses>> {
+        let (kind, settings) = split_kind("poses", section)?;
+        let poses = (self.poses(&kind)?.build)(&settings, context, device)?;
+        check_parameters(&format!("poses {kind}"), &poses.parameters(), &poses.groups())?;
+        Ok(poses)
     }
     /// Builds the optimizer of an `[optimizer]` section (`kind` and its settings).
     pub fn build_optimizer(&self, section: &toml::Table) -> Result<Box<dyn Optimizer>> {

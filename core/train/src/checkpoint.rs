@@ -3,7 +3,7 @@
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
 use crate::schedule::StageLengths;
-use crate::train::{Guard, Neighbours, Parts, RateFactors, Record, TrainState};
+use crate::train::{APPEARANCE, Guard, Neighbours, POSES, Parts, RateFactors, Record, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, SceneOptions, Similarity, Stage, config};
@@ -30,6 +30,9 @@ struct TrainingHeader {
     smooth: bool,
     /// Weights of the appearance model with their lengths.
     appearance: Vec<(String, usize)>,
+    /// Weights of the pose model with their lengths.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    poses: Vec<(String, usize)>,
     /// Arrays of the density control with their lengths.
     density: Vec<(String, usize)>,
     /// Arrays of the guard of density control with their lengths.
@@ -53,6 +56,7 @@ struct TrainingHeader {
 #[derive(Default)]
 struct TrainingArrays {
     appearance: Vec<Vec<f32>>,
+    poses: Vec<Vec<f32>>,
     density: Vec<Vec<f32>>,
     guard: Vec<Vec<f32>>,
     strain: Vec<f32>,
@@ -101,12 +105,17 @@ impl Checkpoint {
         let (model, training) = (self.model, self.training);
         let one = |values: &[f32]| Tensor::<1>::from_data(TensorData::new(values.to_vec(), [values.len()]), &self.device);
         let damaged = |problem: String| Error::data("checkpoint", problem, "Use another checkpoint of the run");
-        let mut weights = parts.appearance.parameters_mut();
-        let found: Vec<(String, usize)> = weights.iter().map(|p| (p.name.clone(), p.value.dims()[0])).collect();
-        if found != training.appearance {
-            return Err(damaged(format!("the appearance model has the weights {found:?}, the checkpoint {:?}", training.appearance)));
+        let of_cameras = [
+            (APPEARANCE, parts.appearance.parameters_mut(), &training.appearance, &self.arrays.appearance),
+            (POSES, parts.poses.parameters_mut(), &training.poses, &self.arrays.poses),
+        ];
+        for (part, mut weights, stored, arrays) in of_cameras {
+            let found: Vec<(String, usize)> = weights.iter().map(|p| (p.name.clone(), p.value.dims()[0])).collect();
+            if found != *stored {
+                return Err(damaged(format!("the plug-in of {part} has the weights {found:?}, the checkpoint {stored:?}")));
+            }
+            weights.iter_mut().zip(arrays).for_each(|(parameter, values)| parameter.value = one(values));
         }
-        weights.iter_mut().zip(&self.arrays.appearance).for_each(|(parameter, values)| parameter.value = one(values));
         let density = training.density.iter().zip(&self.arrays.density).map(|((name, _), values)| (name.clone(), one(values))).collect();
         parts.density.restore(density, model.gaussians.len())?;
         let guard = training.guard.iter().zip(self.arrays.guard).map(|((name, _), values)| (name.clone(), values)).collect();
@@ -160,11 +169,14 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             arrays.add(format!("deformer/{}", parameter.name), &parameter.value)?;
         }
     }
-    let mut appearance = Vec::new();
-    for parameter in state.appearance.parameters() {
-        arrays.add(format!("appearance/{}", parameter.name), &parameter.value)?;
-        appearance.push((parameter.name.clone(), parameter.value.dims()[0]));
+    let mut of_cameras: [Vec<(String, usize)>; 2] = Default::default();
+    for (names, (part, parameters)) in of_cameras.iter_mut().zip(state.of_cameras()) {
+        for parameter in parameters {
+            arrays.add(format!("{part}/{}", parameter.name), &parameter.value)?;
+            names.push((parameter.name.clone(), parameter.value.dims()[0]));
+        }
     }
+    let [appearance, poses] = of_cameras;
     let mut density = Vec::new();
     for (name, values) in state.density.state() {
         arrays.add(format!("density/{name}"), &values)?;
@@ -206,6 +218,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             iteration: state.iteration,
             smooth: state.smooth,
             appearance,
+            poses,
             density,
             guard,
             strain: strain.len(),
@@ -227,7 +240,8 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
         |part: &str, names: &[(String, usize)]| names.iter().map(|(name, len)| file.array(&format!("{part}/{name}"), Some(*len))).collect::<Result<Vec<_>>>();
     let optimizer = training.optimizer.iter().map(|(name, [rows, width])| file.array(&format!("optimizer/{name}"), rows.checked_mul(*width)));
     let arrays = TrainingArrays {
-        appearance: list("appearance", &training.appearance)?,
+        appearance: list(APPEARANCE, &training.appearance)?,
+        poses: list(POSES, &training.poses)?,
         density: list("density", &training.density)?,
         guard: list("guard", &training.guard)?,
         strain: if training.strain > 0 { file.array("strain", Some(training.strain))? } else { Vec::new() },

@@ -54,6 +54,9 @@ pub struct RunConfig {
     /// The appearance plug-in: `kind` and its settings.
     #[serde(default = "no_appearance")]
     pub appearance: toml::Table,
+    /// The pose plug-in: `kind` and its settings.
+    #[serde(default = "no_poses")]
+    pub poses: toml::Table,
     /// The optimizer plug-in: `kind` and its settings.
     #[serde(default = "adam")]
     pub optimizer: toml::Table,
@@ -83,6 +86,9 @@ fn mask_bce() -> toml::Table {
     kind("mask-bce")
 }
 fn no_appearance() -> toml::Table {
+    kind("none")
+}
+fn no_poses() -> toml::Table {
     kind("none")
 }
 fn adam() -> toml::Table {
@@ -147,6 +153,7 @@ impl RunConfig {
         full.rasterizer = config::filled(registry.rasterizer(&kind(&self.rasterizer, "rasterizer")?)?.info.schema, &self.rasterizer)?;
         full.density = config::filled(registry.density(&kind(&self.density, "density")?)?.info.schema, &self.density)?;
         full.appearance = config::filled(registry.appearance(&kind(&self.appearance, "appearance")?)?.info.schema, &self.appearance)?;
+        full.poses = config::filled(registry.poses(&kind(&self.poses, "poses")?)?.info.schema, &self.poses)?;
         full.optimizer = config::filled(registry.optimizer(&kind(&self.optimizer, "optimizer")?)?.info.schema, &self.optimizer)?;
         for section in full.loss.iter_mut().chain([&mut full.score_loss]) {
             *section = config::filled(registry.loss(&kind(section, "loss")?)?.info.schema, section)?;

@@ -29,7 +29,7 @@ fn small(name: &str) -> toml::Table {
 }
 
 /// The plug-ins of this repository, by kind.
-const OURS: [(&str, &[&str]); 9] = [
+const OURS: [(&str, &[&str]); 10] = [
     ("deformer", &["cdf", "cdf-basis", "deform-mlp", "embedding", "free-time", "grid4d", "hash-basis", "hexplane", "native-4d", "none", "swift4d-hash"]),
     ("codec", &["cca", "compact", "quantize", "raw", "sorted-image", "spz", "vq"]),
     ("weight-codec", &["compact", "fp16", "fp32", "int8"]),
@@ -38,6 +38,7 @@ const OURS: [(&str, &[&str]); 9] = [
     ("density", &["clone-split", "mcmc", "none"]),
     ("loss", &["depth", "dssim", "l1", "mask-bce", "mse", "opacity", "photometric", "scale"]),
     ("appearance", &["affine", "none"]),
+    ("poses", &["none", "refined"]),
     ("optimizer", &["adam"]),
 ];
 
@@ -138,6 +139,11 @@ fn every_loss_term_conforms() {
 #[test]
 fn every_appearance_model_conforms() {
     on_every_device("appearance", |registry, name, device| conformance::appearance(registry.appearance(name).unwrap(), &toml::Table::new(), device));
+}
+
+#[test]
+fn every_pose_model_conforms() {
+    on_every_device("poses", |registry, name, device| conformance::poses(registry.poses(name).unwrap(), &toml::Table::new(), device));
 }
 
 #[test]

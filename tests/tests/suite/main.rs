@@ -34,6 +34,7 @@ mod manifests;
 mod observer;
 mod orbit;
 mod planted;
+mod poses;
 mod raster;
 mod raster_edges;
 mod raster_fixtures;

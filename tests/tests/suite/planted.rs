@@ -3,9 +3,9 @@
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    Appearance, AppearanceContext, AppearancePlugin, AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, DensityPlugin, Error,
-    ExporterPlugin, ExtraAttribute, HostGaussians, LossPlugin, Offsets, OptimizerPlugin, Parameter, ParameterGroup, Part, Plugin, RasterizerPlugin, Registry,
-    Result, Seed, Similarity, SpatialFeatures, SpatialInput, WeightCodecPlugin, conformance,
+    Appearance, AppearanceContext, AppearancePlugin, AttributeSpec, Camera, Deformer, DeformerContext, DeformerPlugin, DeformerWork, DensityPlugin, Error,
+    ExporterPlugin, ExtraAttribute, HostGaussians, LossPlugin, Offsets, OptimizerPlugin, Parameter, ParameterGroup, Part, Plugin, PosesPlugin, Rasterizer,
+    RasterizerPlugin, Registry, RenderOutput, RenderSettings, Result, Seed, Similarity, SpatialFeatures, SpatialInput, Splats, WeightCodecPlugin, conformance,
 };
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, Moving, Player, RenderConfig, default_rasterizer};
@@ -210,10 +210,12 @@ fn schemas_that_do_not_state_the_defaults_are_found() {
     let stating = |info: &Plugin, schema: &'static str| Plugin { schema, ..info.clone() };
     let (density, loss) = (registry.density("clone-split").unwrap(), registry.loss("photometric").unwrap());
     let (appearance, optimizer) = (registry.appearance("affine").unwrap(), registry.optimizer("adam").unwrap());
+    let poses = registry.poses("refined").unwrap();
     let others = [
         conformance::density(&DensityPlugin { info: stating(&density.info, "min_opacity = 0.5"), build: density.build }, &none, &flex),
         conformance::loss(&LossPlugin { info: stating(&loss.info, "l1_share = 0.5"), build: loss.build, fuses: None }, &none, &registry, &flex),
         conformance::appearance(&AppearancePlugin { info: stating(&appearance.info, "lr = 0.5"), build: appearance.build }, &none, &flex),
+        conformance::poses(&PosesPlugin { info: stating(&poses.info, "lr = 0.5"), build: poses.build }, &none, &flex),
         conformance::optimizer(&OptimizerPlugin { info: stating(&optimizer.info, "beta1 = 0.5"), build: optimizer.build }, &none, &flex),
     ];
     assert!(others.iter().all(|found| found.len() == 1 && found[0].contains("schema")), "{others:?}");
@@ -225,6 +227,28 @@ fn schemas_that_do_not_state_the_defaults_are_found() {
         conformance::weight_codec(&WeightCodecPlugin { info: stating(&weights.info, "bits = 16"), build: weights.build }, &none),
     ];
     assert!(refused.iter().all(|found| found.len() == 1 && found[0].contains("it refuses the settings that its schema states")), "{refused:?}");
+}
+
+/// The rasterizer `tile`, but for a panic where there is nothing to draw.
+struct Impatient(Box<dyn Rasterizer>);
+
+impl Rasterizer for Impatient {
+    fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput> {
+        assert!(splats.means.dims()[0] > 0, "a mistake");
+        self.0.render(splats, camera, settings)
+    }
+}
+
+fn build_impatient(settings: &toml::Table) -> Result<Box<dyn Rasterizer>> {
+    Ok(Box::new(Impatient((Registry::collect()?.rasterizer("tile")?.build)(settings)?)))
+}
+
+#[test]
+fn rasterizers_that_panic_are_found() {
+    let tile = Registry::collect().unwrap().rasterizer("tile").unwrap();
+    let plugin = RasterizerPlugin { info: tile.info.clone(), build: build_impatient };
+    let found = conformance::rasterizer(&plugin, &toml::Table::new(), &Device::flex());
+    assert!(found.len() == 1 && found[0].contains("background: it panics"), "{found:?}");
 }
 
 /// A gain per training camera, each an array of its own.

@@ -23,6 +23,7 @@ mod run;
 mod table;
 mod trained;
 mod training;
+mod views;
 
 pub use collect::{Collection, Missing, Tables, collect, select, write_tables};
 pub use emit::{EmitOptions, INTERRUPTED, Scheduler, emit};

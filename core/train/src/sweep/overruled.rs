@@ -1,8 +1,8 @@
 //! Refuses what a grid states to no effect: settings that its own keys overrule, sizes of nothing, and families that no method is put on.
 
 use super::grid::{Axis, Grid};
-use super::plan::within;
-use cc4dgs_core::{Error, Result, config};
+use super::plan::{PlannedTraining, within};
+use cc4dgs_core::{Error, Registry, Result, config};
 
 /// Refuses `grid`, which `object` names, where something that it states would have no effect. Files of settings (`config`) may state anything: the keys of the
 /// grid are meant to take the place of theirs.
@@ -31,6 +31,39 @@ pub(super) fn refuse_overruled(object: &str, grid: &Grid) -> Result<()> {
         return Err(Error::parameter(format!("{object}: [[scene]] '{}', family", scene.name), problem, remedy));
     }
     Ok(())
+}
+
+/// Refuses `auto.minutes` in a `set` of `grid` that belongs to none of the `trainings` whose plan is still to be made.
+///
+/// # Errors
+/// [`Error::Parameter`] that names section, value and remedy; as [`PlannedTraining::layers`].
+pub(super) fn refuse_minutes(grid: &Grid, trainings: &[PlannedTraining], registry: &Registry) -> Result<()> {
+    let mut planned = Vec::new();
+    for training in trainings {
+        if training.layers(registry)?.want_plan() {
+            planned.push(training);
+        }
+    }
+    refuse_minutes_in("set".into(), &grid.set, !planned.is_empty())?;
+    for scene in &grid.scene {
+        refuse_minutes_in(format!("[[scene]] '{}', set", scene.name), &scene.set, planned.iter().any(|training| training.scene == scene.name))?;
+    }
+    for method in &grid.method {
+        refuse_minutes_in(format!("[[method]] '{}', set", method.name), &method.set, planned.iter().any(|training| training.method == method.name))?;
+    }
+    for setting in &grid.setting {
+        refuse_minutes_in(format!("[[setting]] '{}', set", setting.name), &setting.set, planned.iter().any(|training| training.setting == setting.name))?;
+    }
+    Ok(())
+}
+
+/// Refuses `auto.minutes` in the list `set` of `section`, unless a training that it belongs to `is_planned`.
+fn refuse_minutes_in(section: String, set: &[String], is_planned: bool) -> Result<()> {
+    let mut stated = toml::Table::new();
+    config::set_all(&mut stated, set)?;
+    let Some(minutes) = value_at(&stated, "auto.minutes").filter(|_| !is_planned) else { return Ok(()) };
+    let problem = format!("{minutes} has no effect: only the preset auto plans for a time");
+    Err(Error::parameter(format!("{section}: auto.minutes"), problem, "Use a preset auto or auto+METHOD, or set train.iterations"))
 }
 
 /// The settings of each value of an axis, with their section in the grid.

@@ -4,7 +4,9 @@ use super::facts::{fingerprint, listing, would_be_part};
 use super::grid::{Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
 use super::hash::{ContentHash, name_of};
 use super::location::locate;
+use super::overruled::refuse_minutes;
 use super::result::{CodecChoice, DataFingerprint};
+use super::views::refuse_too_few;
 use crate::code;
 use crate::config::RunConfig;
 use crate::layers::Layers;
@@ -107,7 +109,8 @@ impl Plan {
     /// Expands `grid`. Every configuration is read strictly; where it is known before the scene is looked at, `check` is asked about it too.
     ///
     /// # Errors
-    /// [`Error::Parameter`] that names the section of the grid, the wrong key or value, and the remedy; [`Error::Io`] for unreadable datasets.
+    /// [`Error::Parameter`] that names the section of the grid, the wrong key or value, and the remedy, also for scenes with too few views; [`Error::Io`] for
+    /// unreadable datasets.
     pub fn expand(grid: &Grid, registry: &Registry, check: &dyn Fn(&RunConfig) -> Result<()>) -> Result<Self> {
         let (version, commit) = code::version();
         let codecs = codecs(grid, registry)?;
@@ -144,7 +147,9 @@ impl Plan {
                 }
             }
         }
+        refuse_minutes(grid, &plan.trainings, registry).map_err(|error| within(&format!("grid {}", grid.name), error))?;
         refuse_image_sizes(&plan.trainings, registry)?;
+        refuse_too_few(grid, &plan.trainings, registry)?;
         Ok(plan)
     }
     /// A name of the trainings in their order: an index means the same training as long as it is the same.
@@ -302,7 +307,12 @@ fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &
         if layers.state("deformer.kind") {
             // Settings may be stated of plug-ins that the plan will name.
             let usual: RunConfig = config::parse_section("configuration", &toml::Table::new())?;
-            for (key, section, usual) in [("density.kind", &mut known.density, usual.density), ("appearance.kind", &mut known.appearance, usual.appearance)] {
+            let sections = [
+                ("density.kind", &mut known.density, usual.density),
+                ("appearance.kind", &mut known.appearance, usual.appearance),
+                ("poses.kind", &mut known.poses, usual.poses),
+            ];
+            for (key, section, usual) in sections {
                 if !layers.state(key) {
                     *section = usual;
                 }
@@ -342,7 +352,7 @@ fn refuse_image_sizes(trainings: &[PlannedTraining], registry: &Registry) -> Res
 }
 
 /// `error` with the training it is about.
-fn at(training: &PlannedTraining, error: Error) -> Error {
+pub(super) fn at(training: &PlannedTraining, error: Error) -> Error {
     within(&format!("training '{}' (preset '{}')", training.label(), training.preset), error)
 }
 

@@ -1,5 +1,5 @@
 //! The three-stage trainer (paper Section V): coarse, dynamic score, main. It is composed of parts that are found by name: deformer, rasterizer, density control, loss terms,
-//! appearance model and optimizer.
+//! appearance model, pose model and optimizer.
 
 mod capacity;
 mod cost;
@@ -45,6 +45,7 @@ pub(crate) use pace::growth;
 pub use record::Record;
 pub(crate) use record::Score;
 pub use refit::{RefitJob, prune_and_refit};
+pub(crate) use state::{APPEARANCE, POSES};
 pub use state::{Parts, TrainState};
 pub(crate) use strain::Neighbours;
 pub use tune::{TuneJob, Tuner};
@@ -59,7 +60,7 @@ use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
 use crate::schedule::StageLengths;
 use burn::tensor::{Device, Tensor};
-use cc4dgs_core::{AppearanceContext, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, parse_device};
+use cc4dgs_core::{AppearanceContext, Event, EventSink, PosesContext, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, parse_device};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::{Model, Moving};
 use moving::decide_moving;
@@ -156,7 +157,7 @@ pub(crate) struct Context<'a> {
 /// [`Error::Parameter`] for settings out of range, before anything is written, and for going on without a folder, [`Error::Interrupted`] after `stop` was set
 /// (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with lower rates, [`Error::Data`] for a scene that
 /// cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own earlier scores (the checkpoint is
-/// kept), and whatever the scene, the plug-ins or the disk report.
+/// kept), and whatever the scene, the plug-ins or the disk report. A checkpoint is written before the error of an image that cannot be read any more.
 ///
 /// [`Error::Parameter`]: cc4dgs_core::Error::Parameter
 /// [`Error::Interrupted`]: cc4dgs_core::Error::Interrupted
@@ -193,6 +194,11 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         appearance: job.registry.build_appearance(
             &config.appearance,
             &AppearanceContext { cameras: training_camera.len(), seed: seed.child("appearance") },
+            &device,
+        )?,
+        poses: job.registry.build_poses(
+            &config.poses,
+            &PosesContext { cameras: training_camera.len(), extent: f64::from(job.scene.extent()), seed: seed.child("poses") },
             &device,
         )?,
         density: job.registry.build_density(&config.density)?,
@@ -271,6 +277,9 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     }
     context.ends = None;
     context.save(&mut state)?;
+    if let Some(message) = state.poses.summary()? {
+        job.events.emit(&Event::Note { object: "poses".into(), message });
+    }
     let verdict = watch.conclude(&context, &mut state)?;
     let dynamic_gaussians = state.moving_rows(&context.device)?.count();
     let report = TrainReport {

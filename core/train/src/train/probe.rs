@@ -3,7 +3,7 @@
 use super::{Context, TrainState};
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Gaussians, Result, Scene, SpatialInput, Splats, ordered_sum};
+use cc4dgs_core::{Camera, Error, Gaussians, Posed, Result, Scene, SpatialInput, Splats, ordered_sum};
 
 /// Mean of all `values`, the same bits whatever the number of threads; `object` names it in errors.
 pub(super) fn mean<const D: usize>(values: Tensor<D>, object: &str) -> Result<f32> {
@@ -19,7 +19,32 @@ pub(super) fn psnr_db(image: Tensor<3>, target: Tensor<3>) -> Result<f32> {
     Ok(-10.0 * error.clamp(1e-10, f32::INFINITY).log10())
 }
 
+/// The pose of `camera` as errors name it.
+pub(super) fn broken_pose(camera: &Camera) -> String {
+    format!("the corrected pose of camera {}", camera.name)
+}
+
 impl Context<'_> {
+    /// The camera of `view` of `scene`, which has the views of the run, as the pose model corrects it; `None` where it is that of the scene.
+    pub(crate) fn posed(&self, scene: &Scene, state: &TrainState, view: usize) -> Result<Option<Posed>> {
+        let Some(&index) = self.training_camera.get(&scene.views[view].camera) else { return Ok(None) };
+        state.poses.corrected(scene.camera(view), index)
+    }
+    /// The camera of `view` where the run believes it to be.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] for a corrected pose that is not finite or not rigid.
+    pub(crate) fn camera_of(&self, scene: &Scene, state: &TrainState, view: usize) -> Result<Camera> {
+        let Some(Posed { camera, .. }) = self.posed(scene, state, view)? else { return Ok(scene.camera(view).clone()) };
+        if camera.validate().is_err() {
+            return Err(Error::backend(
+                broken_pose(&camera),
+                "it is not finite, or not rigid",
+                "Lower the learning rates of poses, or choose another pose model",
+            ));
+        }
+        Ok(camera)
+    }
     /// Renders what the cameras of views record at given times (0..1). `gaussians` have the rows of `state`. Hands the index of each request and planes
     /// `[3,H,W]` to `each`.
     pub(crate) fn draw(
@@ -59,9 +84,10 @@ impl Context<'_> {
                 (Some(features), Some(deformer)) => deformer.field.deform(features.clone(), time_norm)?.apply(deformer.name(), gaussians, rows.indices())?,
                 _ => gaussians.clone(),
             };
-            let output = self.rasterizer.render(&Splats::from_gaussians(&drawn, sh_degree), scene.camera(view), &settings)?;
-            let camera = self.training_camera.get(&scene.views[view].camera).copied();
-            each(index, state.appearance.apply(output.planes, camera)?.narrow(0, 0, 3))?;
+            let camera = self.camera_of(scene, state, view)?;
+            let output = self.rasterizer.render(&Splats::from_gaussians(&drawn, sh_degree), &camera, &settings)?;
+            let own = self.training_camera.get(&scene.views[view].camera).copied();
+            each(index, state.appearance.apply(output.planes, own)?.narrow(0, 0, 3))?;
         }
         Ok(())
     }

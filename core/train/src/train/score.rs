@@ -23,14 +23,14 @@ impl Context<'_> {
         let gaussians = leaves.gaussians()?;
         let mut splats = Splats::from_gaussians(&gaussians, 0);
         splats.colors = SplatColors::Direct(leaves.get("dynamic_scores")?.clone().repeat_dim(1, 3));
-        let camera = self.job.scene.camera(mask.view);
+        let camera = self.camera_of(&self.job.scene, state, mask.view)?;
         let settings = self.job.config.render.settings(None);
-        let output = self.rasterizer.render(&splats, camera, &settings)?;
+        let output = self.rasterizer.render(&splats, &camera, &settings)?;
         let (w, h) = (camera.width as usize, camera.height as usize);
         let wanted: Vec<f32> = mask.mask.iter().map(|&moves| f32::from(u8::from(moves))).collect();
         let target = Tensor::<3>::from_inner(Tensor::from_data(TensorData::new(wanted, [1, h, w]), &self.device));
         let (view, radii) = (&self.job.scene.views[mask.view], &output.stats.radii);
-        let loss = self.score_loss.value(&LossInput::new(camera, view, &output.planes, &target, &gaussians, radii, schedule))?;
+        let loss = self.score_loss.value(&LossInput::new(&camera, view, &output.planes, &target, &gaussians, radii, schedule))?;
         if log.due(iteration) || check {
             let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);
             if !value.is_finite() {

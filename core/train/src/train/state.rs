@@ -10,7 +10,9 @@ use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Appearance, DeformerContext, DensityControl, HostGaussians, Optimizer, Result, Scene, Seed, Similarity, SpatialInput, Split, Stage};
+use cc4dgs_core::{
+    Appearance, DeformerContext, DensityControl, HostGaussians, Optimizer, Parameter, Poses, Result, Scene, Seed, Similarity, SpatialInput, Split, Stage,
+};
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Moving, MovingRows, RenderConfig};
 
@@ -32,6 +34,8 @@ pub struct TrainState {
     pub deformer: Option<ModelDeformer>,
     /// Between rendered and recorded images.
     pub appearance: Box<dyn Appearance>,
+    /// Corrects the poses of training cameras.
+    pub poses: Box<dyn Poses>,
     /// Adds, moves and removes Gaussians.
     pub density: Box<dyn DensityControl>,
     /// Keeps density control from doing harm.
@@ -62,16 +66,22 @@ pub(crate) fn longest_focal(scene: &Scene) -> Option<f64> {
 pub struct Parts {
     /// Between rendered and recorded images.
     pub appearance: Box<dyn Appearance>,
+    /// Corrects the poses of training cameras.
+    pub poses: Box<dyn Poses>,
     /// Adds, moves and removes Gaussians.
     pub density: Box<dyn DensityControl>,
     /// Steps everything that learns.
     pub optimizer: Box<dyn Optimizer>,
 }
 
+/// Names of the parts of a training that learn of cameras: in arrays of checkpoints, in messages, and for the factors of learning rates.
+pub(crate) const APPEARANCE: &str = "appearance";
+pub(crate) const POSES: &str = "poses";
+
 impl TrainState {
     /// A fresh run.
     pub fn new(set: GaussianSet, moving: Moving, normalisation: Similarity, focal: Option<f64>, parts: Parts) -> Self {
-        let Parts { appearance, density, optimizer } = parts;
+        let Parts { appearance, poses, density, optimizer } = parts;
         let guard = Guard::default();
         Self {
             stage: Stage::Coarse,
@@ -82,6 +92,7 @@ impl TrainState {
             focal,
             deformer: None,
             appearance,
+            poses,
             density,
             guard,
             optimizer,
@@ -103,6 +114,14 @@ impl TrainState {
         self.optimizer.restart("");
         self.density.begin_stage(self.set.len(), device);
         self.guard.begin_stage(self.set.len());
+    }
+    /// The weights of the parts that learn of cameras, by the name of the part.
+    pub(crate) fn of_cameras(&self) -> [(&'static str, Vec<&Parameter>); 2] {
+        [(APPEARANCE, self.appearance.parameters()), (POSES, self.poses.parameters())]
+    }
+    /// As [`TrainState::of_cameras`], to be changed.
+    pub(crate) fn of_cameras_mut(&mut self) -> [(&'static str, Vec<&mut Parameter>); 2] {
+        [(APPEARANCE, self.appearance.parameters_mut()), (POSES, self.poses.parameters_mut())]
     }
     /// The rows the deformer moves; kept until the set changes.
     pub fn moving_rows(&mut self, device: &Device) -> Result<MovingRows> {

@@ -4,9 +4,10 @@ use super::capacity::Drawn;
 use super::dropout;
 use super::log::Log;
 use super::losses::single;
-use super::probe::psnr_db;
+use super::probe::{broken_pose, psnr_db};
 use super::rounded::{ExactWeights, Rounded};
 use super::smoothness::{flicker, smoothness};
+use super::state::{APPEARANCE, POSES};
 use super::watchdog::{TOLERATED, Trouble, broken_rows_of, is_finite};
 use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
@@ -41,7 +42,7 @@ struct Rendered<'a> {
     absolute_screen_probe: Option<Tensor<2>>,
     radii: Tensor<1, Int>,
     max_weights: Option<Tensor<1>>,
-    camera: &'a Camera,
+    camera: Camera,
     view: &'a View,
 }
 
@@ -90,7 +91,14 @@ impl Context<'_> {
             }
             _ => None,
         };
-        parameters::track(state.appearance.parameters_mut());
+        for (_, parameters) in state.of_cameras_mut() {
+            parameters::track(parameters);
+        }
+        // Before anything is drawn, so that no view waits for the images before it until its pose is read.
+        let posed = batch.iter().map(|&view| self.posed(scene, state, view)).collect::<Result<Vec<_>>>()?;
+        if let Some(broken) = posed.iter().flatten().find(|posed| posed.camera.validate().is_err()) {
+            return Ok(Outcome::Trouble(Trouble::of(POSES, broken_pose(&broken.camera))));
+        }
 
         let statistics = state.density.statistics(schedule);
         let background_rgb = self.job.config.background()?;
@@ -110,8 +118,8 @@ impl Context<'_> {
             }
         }
         let mut offsets = offsets.into_iter();
-        for &view in batch {
-            let camera = scene.camera(view);
+        for (&view, posed) in batch.iter().zip(&posed) {
+            let camera = posed.as_ref().map_or_else(|| scene.camera(view), |posed| &posed.camera);
             let drawn = match (offsets.next(), &state.deformer) {
                 (Some(offsets), Some(deformer)) => {
                     offsets.check(deformer.name(), rows.count())?;
@@ -140,6 +148,7 @@ impl Context<'_> {
             let (screen_probe, absolute_screen_probe) = (probe(Statistic::ScreenGradient), probe(Statistic::AbsoluteScreenGradient));
             splats.screen_probe = screen_probe.clone();
             splats.absolute_screen_probe = absolute_screen_probe.clone();
+            splats.camera_probe = posed.as_ref().map(|posed| posed.probe.clone());
             let key = (scene.views[view].camera, camera.width, camera.height);
             let capacity = if count { None } else { state.capacities.of(key) };
             let output = self.rasterizer.render(&splats, camera, &RenderSettings { pair_capacity: capacity, ..settings.clone() })?;
@@ -168,6 +177,7 @@ impl Context<'_> {
                 None => radii.clone(),
             });
             let (max_weights, view) = (output.stats.max_weights, &scene.views[view]);
+            let camera = camera.clone();
             rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera, view });
         }
         let Some(mut loss) = total else { return Ok(Outcome::Stepped) };
@@ -186,11 +196,14 @@ impl Context<'_> {
         if let Some(term) = state.appearance.regularizer()? {
             loss = loss + single("regularizer of the appearance model", term)?;
         }
+        if let Some(term) = state.poses.regularizer()? {
+            loss = loss + single("regularizer of the pose model", term)?;
+        }
         if read || check {
             let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);
             if !value.is_finite() {
                 // The terms of the images are finite, so it is one of the others.
-                return Ok(Outcome::Trouble(Trouble::new("the regularizer of deformer or appearance model, or smoothness")));
+                return Ok(Outcome::Trouble(Trouble::new("the regularizer of deformer, appearance or pose model, or smoothness")));
             }
             if read {
                 log.loss(value);
@@ -208,7 +221,7 @@ impl Context<'_> {
         for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera, view } in rendered {
             let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
             state.guard.saw(&radii);
-            let mut of_view = ViewStatistics::new(camera.clone(), view.clone(), radii);
+            let mut of_view = ViewStatistics::new(camera, view.clone(), radii);
             (of_view.screen_gradient, of_view.absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));
             (of_view.max_weights, of_view.views) = (max_weights, batch.len());
             state.density.observe(&of_view)?;
@@ -219,7 +232,7 @@ impl Context<'_> {
         }
         let deformed = spatial.is_some();
         // Whoever else holds the values would keep the optimizer from working in place.
-        drop((leaves, gaussians, loss, spatial));
+        drop((leaves, gaussians, loss, spatial, posed));
         let visible = if train.sparse_adam { seen } else { None };
         if let Some(visible) = &visible
             && read
@@ -241,7 +254,7 @@ impl Context<'_> {
             None => self.step_gaussians(state, of_gaussians, |name| StepSettings { visible: visible.as_ref(), ..StepSettings::new(rate(name)) })?,
         }
         let of_group = |group: &ParameterGroup| scale * parameters::rate(group, progress, extent);
-        let TrainState { deformer, appearance, optimizer, .. } = state;
+        let TrainState { deformer, appearance, poses, optimizer, .. } = state;
         if let Some(deformer) = deformer.as_mut().filter(|_| deformed) {
             let groups = deformer.field.groups();
             let exact = state.rounded.as_mut().map(Rounded::exact).unwrap_or_default();
@@ -249,9 +262,11 @@ impl Context<'_> {
                 rates.of_deformer() * of_group(group)
             })?;
         }
-        let groups = appearance.groups();
-        let of_group = |group: &ParameterGroup| rates.of_appearance() * of_group(group);
-        parameters::update("appearance/", appearance.parameters_mut(), ExactWeights::default(), &groups, &gradients, optimizer.as_mut(), of_group)?;
+        let of_cameras = [(APPEARANCE, appearance.groups(), appearance.parameters_mut()), (POSES, poses.groups(), poses.parameters_mut())];
+        for (part, groups, parameters) in of_cameras {
+            let of_group = |group: &ParameterGroup| rates.of(part) * of_group(group);
+            parameters::update(&format!("{part}/"), parameters, ExactWeights::default(), &groups, &gradients, optimizer.as_mut(), of_group)?;
+        }
         log.step(self.job.events, schedule.iteration, state.set.len());
         Ok(Outcome::Stepped)
     }
@@ -337,7 +352,8 @@ fn broken_gradient(state: &TrainState, of_gaussians: &[(String, Tensor<2>)], gra
         return Ok(Some(trouble));
     }
     let deformer = state.deformer.iter().flat_map(|d| d.field.parameters()).map(|p| ("deformer", p));
-    let weights = deformer.chain(state.appearance.parameters().into_iter().map(|p| ("appearance", p)));
+    let of_cameras = state.of_cameras().into_iter().flat_map(|(part, parameters)| parameters.into_iter().map(move |p| (part, p)));
+    let weights = deformer.chain(of_cameras);
     // Weights that took no part in the step are not tracked.
     for (part, parameter) in weights.filter(|(_, p)| p.value.is_require_grad()) {
         if let Some(gradient) = parameter.value.grad(gradients)

@@ -22,13 +22,21 @@ const IDENTITY: f64 = 1e-4;
 /// Transforms of a smaller determinant are not undone: what they do to colours is noise.
 const LEAST_DETERMINANT: f64 = 1e-3;
 
-/// Whether `model` was trained with colours per camera.
-///
-/// # Errors
-/// [`Error::Parameter`] for a configuration of another version.
-pub(super) fn had_colours_per_camera(model: &Model) -> Result<bool> {
-    let config: RunConfig = config::parse_section("configuration of the model", &model.provenance.config)?;
-    Ok(config.appearance.get("kind").and_then(|kind| kind.as_str()).unwrap_or("none") != "none")
+/// What `model` was trained with per camera that models do not keep.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct PerCamera {
+    pub colours: bool,
+    pub poses: bool,
+}
+
+impl PerCamera {
+    /// # Errors
+    /// [`Error::Parameter`] for a configuration of another version.
+    pub fn of(model: &Model) -> Result<Self> {
+        let config: RunConfig = config::parse_section("configuration of the model", &model.provenance.config)?;
+        let any = |section: &toml::Table| section.get("kind").and_then(|kind| kind.as_str()).unwrap_or("none") != "none";
+        Ok(Self { colours: any(&config.appearance), poses: any(&config.poses) })
+    }
 }
 
 /// The scene of `job` with the images to train on.
@@ -37,7 +45,12 @@ pub(super) fn had_colours_per_camera(model: &Model) -> Result<bool> {
 /// [`Error::Interrupted`], and what scene and device report.
 pub(super) fn targets(job: &TuneJob) -> Result<Arc<Scene>> {
     let scene = &job.scene;
-    if !had_colours_per_camera(job.model)? {
+    let PerCamera { colours, poses } = PerCamera::of(job.model)?;
+    if poses {
+        let message = "trained with corrected poses of its cameras, which models do not keep: it is trained further with the poses of the dataset";
+        job.events.emit(&Event::Warning { object: "model".into(), message: message.into() });
+    }
+    if !colours {
         return Ok(scene.clone());
     }
     let mut views: BTreeMap<usize, Vec<usize>> = BTreeMap::new();

@@ -7,7 +7,7 @@ use super::pyramid::Pyramid;
 use super::rounded::{Rounded, WeightScale};
 use super::sampler::Sampler;
 use super::stored_weights::StoredWeights;
-use super::targets::{had_colours_per_camera, targets};
+use super::targets::{PerCamera, targets};
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
@@ -15,8 +15,8 @@ use crate::sample::spread_views;
 use crate::schedule::StageLengths;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::{
-    AppearanceContext, EncodedWeights, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, TuneModel,
-    TunedModel, Tuning, WeightArray, WeightCodec, config, psnr_of,
+    AppearanceContext, EncodedWeights, Error, Event, EventSink, HostGaussians, Limits, PosesContext, Registry, Result, Scene, Schedule, Seed, Split, Stage,
+    TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, config, psnr_of,
 };
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, load_weights, weights_of};
@@ -124,7 +124,8 @@ impl<'a> Tuner<'a> {
         let mut config: RunConfig = config::parse_section("configuration of the model", &model.provenance.config)?;
         (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
-        (config.density, config.appearance, config.train.image_growth, config.train.sh_every) = (none(), none(), 0.0, 1);
+        (config.density, config.appearance, config.poses) = (none(), none(), none());
+        (config.train.image_growth, config.train.sh_every) = (0.0, 1);
         (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
         // Learning rates are shares of those of the training, whose iterations drew no more views than there are.
         config.train.batch = config.train.batch.min(views);
@@ -152,6 +153,7 @@ impl<'a> Tuner<'a> {
         let training_camera = training_cameras(scene);
         let parts = Parts {
             appearance: registry.build_appearance(&config.appearance, &AppearanceContext { cameras: training_camera.len(), seed }, device)?,
+            poses: registry.build_poses(&config.poses, &PosesContext { cameras: training_camera.len(), extent: f64::from(scene.extent()), seed }, device)?,
             density: registry.build_density(&config.density)?,
             optimizer: registry.build_optimizer(&config.optimizer)?,
         };
@@ -257,8 +259,14 @@ pub(super) fn rate_at(done: f64) -> f64 {
 
 impl TuneModel for Tuner<'_> {
     fn caution(&self) -> Result<Option<String>> {
-        let why = "it was trained with colours per camera; what such models gain on training views may be lost on others";
-        Ok(had_colours_per_camera(self.job.model)?.then(|| why.into()))
+        let PerCamera { colours, poses } = PerCamera::of(self.job.model)?;
+        let what = match (colours, poses) {
+            (false, false) => return Ok(None),
+            (true, false) => "colours per camera",
+            (false, true) => "corrected poses of its cameras",
+            (true, true) => "colours per camera and corrected poses",
+        };
+        Ok(Some(format!("it was trained with {what}; what such models gain on training views may be lost on others")))
     }
     fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
         let weights = self.moving_field().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();

@@ -30,14 +30,13 @@ const LOWERED: f64 = 0.25;
 pub(crate) const TOLERATED: f64 = 0.01;
 /// Names of the parts beside `gaussians/ATTRIBUTE`.
 const DEFORMER: &str = "deformer";
-const APPEARANCE: &str = "appearance";
 
 /// Something that is not finite.
 #[derive(Clone, Debug)]
 pub(crate) struct Trouble {
     /// What it is, as the subject of a sentence.
     pub what: String,
-    /// The part whose learning rate is to blame, if that is known: `gaussians/means`, `deformer`, `appearance`.
+    /// The part whose learning rate is to blame, if that is known: `gaussians/means`, `deformer`, `appearance`, `poses`.
     pub part: Option<String>,
 }
 
@@ -100,9 +99,6 @@ impl RateFactors {
     pub(crate) fn of_deformer(&self) -> f64 {
         self.of(DEFORMER)
     }
-    pub(crate) fn of_appearance(&self) -> f64 {
-        self.of(APPEARANCE)
-    }
 }
 
 /// A state to go back to.
@@ -112,7 +108,7 @@ struct Good {
     /// The settings of the deformer: it may be given lives on the way.
     section: Option<toml::Table>,
     deformer: Vec<Tensor<1>>,
-    appearance: Vec<Tensor<1>>,
+    of_cameras: [Vec<Tensor<1>>; 2],
     optimizer: OptimizerState,
     density: Vec<(String, Tensor<1>)>,
     guard: Guard,
@@ -132,7 +128,7 @@ impl Good {
             set: state.set.clone(),
             section: state.deformer.as_ref().map(|d| d.section.clone()),
             deformer: state.deformer.as_ref().map(|d| values(d.field.parameters())).unwrap_or_default(),
-            appearance: values(state.appearance.parameters()),
+            of_cameras: state.of_cameras().map(|(_, parameters)| values(parameters)),
             optimizer: state.optimizer.state(),
             density: state.density.state(),
             guard: state.guard.clone(),
@@ -151,7 +147,9 @@ impl Good {
             }
             deformer.field.parameters_mut().into_iter().zip(&self.deformer).for_each(|(p, value)| p.value = value.clone());
         }
-        state.appearance.parameters_mut().into_iter().zip(&self.appearance).for_each(|(p, value)| p.value = value.clone());
+        for ((_, parameters), then) in state.of_cameras_mut().into_iter().zip(&self.of_cameras) {
+            parameters.into_iter().zip(then).for_each(|(p, value)| p.value = value.clone());
+        }
         state.optimizer.restart("");
         state.optimizer.restore(self.optimizer.clone())?;
         // What a control counts beside its arrays begins anew; the arrays continue.
@@ -255,7 +253,8 @@ fn unsound(state: &TrainState) -> Result<Option<Trouble>> {
         }
     }
     let deformer = state.deformer.iter().flat_map(|d| d.field.parameters());
-    let weights = deformer.map(|p| (DEFORMER, p)).chain(state.appearance.parameters().into_iter().map(|p| (APPEARANCE, p)));
+    let of_cameras = state.of_cameras().into_iter().flat_map(|(part, parameters)| parameters.into_iter().map(move |p| (part, p)));
+    let weights = deformer.map(|p| (DEFORMER, p)).chain(of_cameras);
     for (part, parameter) in weights {
         if !is_finite(&parameter.value, &parameter.name)? {
             return Ok(Some(Trouble::of(part, format!("the weights '{}' of {part}", parameter.name))));
@@ -281,7 +280,8 @@ fn fastest(state: &TrainState, good: &Good) -> Result<String> {
         consider(format!("gaussians/{name}"), largest(to_vec(values.clone(), name)?), largest(then));
     }
     let deformer = state.deformer.as_ref().map(|d| values(d.field.parameters())).unwrap_or_default();
-    for (part, now, then) in [(DEFORMER, deformer, &good.deformer), (APPEARANCE, values(state.appearance.parameters()), &good.appearance)] {
+    let of_cameras = state.of_cameras().into_iter().zip(&good.of_cameras).map(|((part, parameters), then)| (part, values(parameters), then));
+    for (part, now, then) in std::iter::once((DEFORMER, deformer, &good.deformer)).chain(of_cameras) {
         let mut sizes = [0.0f32; 2];
         for (size, arrays) in sizes.iter_mut().zip([&now, then]) {
             for array in arrays {

@@ -13,7 +13,7 @@ use crate::masks::blur;
 use crate::sample::spread_views;
 use blobs::blobs;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage, plural};
+use cc4dgs_core::{Camera, Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage, plural};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use glam::DVec3;
@@ -41,6 +41,8 @@ const LEAST_EXPLAINED: f64 = 0.35;
 /// What a view shows and the model does not. Images are not kept: they are loaded once more for the colours of what is added.
 struct Lost {
     view: usize,
+    /// Where the run believes it to be.
+    camera: Camera,
     sightings: Vec<Sighting>,
 }
 
@@ -112,11 +114,12 @@ impl Context<'_> {
         let background = self.job.config.background()?;
         let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
         let gaussians = state.set.gaussians()?;
+        let cameras: Vec<Camera> = views.iter().map(|&view| self.camera_of(scene, state, view)).collect::<Result<_>>()?;
         let mut lost = Vec::with_capacity(views.len());
         self.draw(state, &gaussians, &requests, schedule.sh_degree, |index, drawn| {
             let drawn = to_vec(drawn, "drawn view")?;
             let view = views[index];
-            let camera = scene.camera(view);
+            let camera = &cameras[index];
             let (w, h) = (camera.width as usize, camera.height as usize);
             let image = scene.frame(view)?.to_planes(background);
             let difference = |p: usize| (0..3).map(|k| (image[k * w * h + p] - drawn[k * w * h + p]).abs()).sum::<f32>() / 3.0;
@@ -132,7 +135,7 @@ impl Context<'_> {
                 Sighting { image: index, time, origin, direction: rotation.transpose() * ray, size: blob.radius_px / focal, pixel: 1.0 / focal }
             };
             let sightings = blobs(&mask, w, BLOBS).into_iter().map(sighting).collect();
-            lost.push(Lost { view, sightings });
+            lost.push(Lost { view, camera: camera.clone(), sightings });
             Ok(())
         })?;
         Ok(lost)

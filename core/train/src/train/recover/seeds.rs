@@ -39,7 +39,7 @@ pub(super) fn plan(context: &Context, state: &TrainState, lost: &[Lost], sightin
     let parents = Parents::new(&state.set.host_gaussians()?, state.moving);
     let points: Vec<(&Track, DVec3)> = tracks.iter().flat_map(|track| normals().map(move |normal| (track, normal))).collect();
     let (host, capped) = gaussians(scene, &points);
-    let pixels: Vec<Option<Pixel>> = points.iter().map(|&(track, normal)| pixel_of(scene, lost, sightings, track, normal)).collect();
+    let pixels: Vec<Option<Pixel>> = points.iter().map(|&(track, normal)| pixel_of(lost, sightings, track, normal)).collect();
     let colours = colours_of(scene, &pixels, context.job.config.background()?)?;
     let mut plan = DensityPlan::unchanged(state.set.len());
     for (i, (&(track, _), colour)) in points.iter().zip(colours).enumerate() {
@@ -98,11 +98,10 @@ struct Pixel {
 
 /// The pixel that shows the point of a track's sphere with this outward `normal`, in the image that sees it most from the front; `None` where that is behind the
 /// camera.
-fn pixel_of(scene: &Scene, lost: &[Lost], sightings: &[Sighting], track: &Track, normal: DVec3) -> Option<Pixel> {
+fn pixel_of(lost: &[Lost], sightings: &[Sighting], track: &Track, normal: DVec3) -> Option<Pixel> {
     let front = |&i: &usize| -sightings[i].direction.dot(normal);
     let best = track.sightings.iter().copied().max_by(|a, b| front(a).total_cmp(&front(b)))?;
-    let view = lost[sightings[best].image].view;
-    let camera = scene.camera(view);
+    let Lost { view, camera, .. } = &lost[sightings[best].image];
     let (rotation, translation) = camera.rotation_translation();
     // Somewhat inside, so that the silhouette's mixed pixels are left out.
     let point = rotation * (track.at(sightings[best].time) + normal * (0.7 * track.radius)) + translation;
@@ -112,7 +111,7 @@ fn pixel_of(scene: &Scene, lost: &[Lost], sightings: &[Sighting], track: &Track,
     let (w, h) = (camera.width as usize, camera.height as usize);
     let pixel = |v: f64, most: usize| (v.max(0.0) as usize).min(most - 1);
     let (x, y) = (pixel(camera.fx * point.x / point.z + camera.cx, w), pixel(camera.fy * point.y / point.z + camera.cy, h));
-    Some(Pixel { view, index: y * w + x })
+    Some(Pixel { view: *view, index: y * w + x })
 }
 
 /// The colours of pixels, grey for those that are none. The image of each view is loaded once, and one is held at a time.

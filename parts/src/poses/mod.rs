@@ -1,0 +1,4 @@
+//! Pose models: corrections of the poses of training cameras.
+
+mod none;
+mod refined;
