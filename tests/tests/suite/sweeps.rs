@@ -7,6 +7,23 @@ use cc4dgs_train::sweep::{Busy, CellResult, Cost, Grid, Plan, SweepFolder, Train
 use std::sync::atomic::AtomicBool;
 
 #[test]
+fn a_scene_with_too_few_views_is_refused_when_the_grid_is_planned() {
+    let registry = Registry::collect().unwrap();
+    let plan = |top: &str| {
+        let grid = format!(
+            "name = 'few'\nsplit = 'validation'\niterations = 40\n{top}\n\
+             [[scene]]\nname = 'four'\npath = 'procedural:tiny'\nfamily = 'demo'\nset = ['scene.max_views=4']\n\
+             [[method]]\nname = 'still'\npreset = '+none'\n\
+             [[codec]]\nname = 'raw'\ncodec = 'raw'\n"
+        );
+        Plan::expand(&Grid::parse("grid", &grid).unwrap(), &registry, &|_: &RunConfig| Ok(())).map(|plan| plan.cells.len()).map_err(|error| error.to_string())
+    };
+    let said = plan("").unwrap_err();
+    assert!(["'four still base seed 0'", "12 of 4 training views", "validation = 1"].iter().all(|part| said.contains(part)), "{said}");
+    assert_eq!(plan("validation = 1"), Ok(1));
+}
+
+#[test]
 fn results_of_a_sweep_do_not_state_the_limits_of_a_machine() {
     let grid = "name = 'small'\niterations = 40\nimages = 0\nmax_views = 1\nset = ['limits.max_depth=50']\n\
                 [[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\nfamily = 'demo'\n\

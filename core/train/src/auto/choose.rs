@@ -3,6 +3,7 @@
 mod stages;
 
 use super::facts::{Arrangement, Facts};
+use super::overlap::Overlap;
 use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::{SceneOptions, plural};
 use stages::stages;
@@ -355,7 +356,10 @@ fn dropout(facts: &Facts) -> Option<Choice> {
 fn decay(facts: &Facts) -> Option<Choice> {
     let fixed = matches!(facts.arrangement, Arrangement::Dome | Arrangement::Photos | Arrangement::Rig) && !stands_alone(facts);
     let are = plural(facts.cameras, "camera is", "cameras are");
-    let reason = format!("{} {are} easily over-fitted: Gaussians that images do not need fade", facts.cameras);
+    let overlap = facts.overlap.as_ref().map_or_else(String::new, |Overlap { cameras, compared, .. }| {
+        format!(", the faster the fewer cameras see the same: half of what a camera sees is seen by {cameras} or more of {compared} cameras")
+    });
+    let reason = format!("{} {are} easily over-fitted: Gaussians that images do not need fade{overlap}", facts.cameras);
     let seen_by = facts.overlap.as_ref().map_or(usize::MAX, |overlap| overlap.cameras);
     let share = DECAYS.iter().find(|(most, _)| seen_by <= *most).map_or(DECAY, |(_, share)| *share);
     (fixed && facts.cameras <= DECAY_CAMERAS).then(|| choice([("density.decay", Value::Float(share))], reason))

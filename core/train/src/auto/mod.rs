@@ -215,12 +215,16 @@ pub fn open_shared(
     let overlap = facts.overlap.iter().map(|overlap| overlap.describe(noun)).collect();
     let skips = skips::describe(&config, registry)?.into_iter().collect();
     config.auto.plan = [vec![seen], overlap, plan.lines(layers), skips].concat();
-    if (config.train.iterations as f64) < SHORT {
-        let few = format!("{} {} few", config.train.iterations, plural(config.train.iterations, "iteration is", "iterations are"));
-        config.auto.plan.push(format!("{few}: more minutes or smaller images (--minutes, scene.width) give a better model"));
-    }
+    config.auto.plan.extend(few(config.train.iterations, layers.state("train.iterations")));
     config.auto.time_left = ends.map(|ends| ends.saturating_duration_since(Instant::now()));
     Ok((config, scene))
+}
+
+/// The line of a plan whose `iterations` are too few for its scene. Where they are `stated`, no time changes them.
+fn few(iterations: usize, stated: bool) -> Option<String> {
+    let are = plural(iterations, "iteration is", "iterations are");
+    let more = if stated { "more of them (train.iterations) give" } else { "more minutes or smaller images (--minutes, scene.width) give" };
+    ((iterations as f64) < SHORT).then(|| format!("{iterations} {are} few: {more} a better model"))
 }
 
 /// An [`Error::Interrupted`] once `stop` is set.
@@ -360,6 +364,13 @@ mod tests {
         let found = [2.0, 3.2, 4.5, 6.0, 9.0].map(|left| views(Arrangement::OneCameraAnywhere, left));
         assert_eq!(found, [1, 2, 3, 4, 4], "as many as leave 1,500 iterations");
         assert_eq!(views(Arrangement::OneMovingCamera, 9.0), 1);
+    }
+
+    #[test]
+    fn few_iterations_have_a_remedy_that_helps() {
+        assert!(few(600, false).is_some_and(|line| line.starts_with("600 iterations are few") && line.contains("--minutes")));
+        assert!(few(600, true).is_some_and(|line| line.contains("train.iterations") && !line.contains("--minutes")));
+        assert_eq!((few(2000, false), few(2000, true)), (None, None));
     }
 
     #[test]

@@ -183,7 +183,7 @@ fn yaml(text: &str) -> String {
 /// The grid's name as schedulers accept it: lower case, digits and '-'.
 fn job_name(plan: &Plan) -> String {
     let name: String = plan.name.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' }).take(40).collect();
-    format!("cc4dgs-{}", name.trim_matches('-'))
+    format!("cc4dgs-{}", name.trim_matches('-')).trim_end_matches('-').to_string()
 }
 
 /// How much there is to do, such as `1 training, 3 cells`.

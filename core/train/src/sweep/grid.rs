@@ -132,11 +132,12 @@ impl<T> Axis<T> {
     }
 }
 
-/// Every value of `table` as `key.of.tables=value`.
+/// Every value of `table` as `key.of.tables=value`. A table with keys that have no such form, such as names of cameras with a dot, is one value.
 fn assignments(table: &toml::Table, prefix: &str, to: &mut Vec<String>) {
+    let has_form = |key: &String| !key.is_empty() && key.trim() == key && !key.contains(['.', '=']);
     for (key, value) in table {
         match value {
-            toml::Value::Table(inner) => assignments(inner, &format!("{prefix}{key}."), to),
+            toml::Value::Table(inner) if inner.keys().all(has_form) => assignments(inner, &format!("{prefix}{key}."), to),
             value => to.push(format!("{prefix}{key}={value}")),
         }
     }
@@ -346,6 +347,12 @@ mod tests {
         let expected = "seed = 9\n[train]\niterations = 5\nbatch = 3\n[train.lr]\nmeans = 0.5\n[[loss]]\nkind = 'l1'\nweight = 1.0\n";
         assert_eq!(made, expected.parse().unwrap());
         assert!(matches!(method("no/such.toml").unwrap_err(), Error::Io { .. }));
+        // Names of cameras have dots.
+        let offsets = "[scene]\nwidth = 8\n[scene.offsets]\ncam01 = 1\n\"videos/a.mp4\" = -2\n";
+        std::fs::write(&file, offsets).unwrap();
+        let mut made = toml::Table::new();
+        config::set_all(&mut made, &method(&file.display().to_string()).unwrap()).unwrap();
+        assert_eq!(made, format!("{offsets}[train]\nbatch = 3\n").parse().unwrap());
     }
 
     #[test]

@@ -111,10 +111,8 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let path = planned_dataset(training)?;
     let memory = PeakMemory::begin();
     std::fs::create_dir_all(&run).map_err(|e| Error::io(&run, e))?;
-    // Once the configuration is written, it decides: a plan of the preset `auto` is made once.
-    let own = run.join(CONFIG);
-    let begun = own.is_file();
-    let resume = run.join(CHECKPOINT).is_file();
+    let (own, resume) = (run.join(CONFIG), run.join(CHECKPOINT).is_file());
+    let begun = has_begun(&run);
     let log = JsonLines::open(&run.join(EVENTS), begun)?;
     let events = Both(&log, worker.events);
     let limits: Vec<String> = worker.limits.iter().map(|limit| format!("limits.{limit}")).collect();
@@ -158,6 +156,12 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     write_atomically(&record, json.as_bytes())?;
     // From the file, as after an interruption: numbers that went through JSON may differ in the last digit.
     read_finished(&record)
+}
+
+/// Whether the training in the folder `run` goes on: then its configuration decides, and a plan of the preset `auto` is not made again. Without a checkpoint it
+/// begins anew, and so does its plan: nothing else says how much of its time is left.
+fn has_begun(run: &Path) -> bool {
+    run.join(CONFIG).is_file() && run.join(CHECKPOINT).is_file()
 }
 
 /// Adds `device` to the devices that `file` has of a training, unless it is there, and returns all of them. A training that has not `begun` has none yet.
@@ -224,6 +228,15 @@ mod tests {
         assert!(message.contains("there is no") && message.contains("run it where the plan was made"), "{message}");
         std::fs::create_dir(folder.path().join("moved")).unwrap();
         assert!(planned_dataset(&training).unwrap_err().to_string().contains("not those of the plan"));
+    }
+
+    #[test]
+    fn a_training_without_a_checkpoint_begins_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(CONFIG), "").unwrap();
+        assert!(!has_begun(folder.path()), "the length of a plan would never be settled");
+        std::fs::write(folder.path().join(CHECKPOINT), "").unwrap();
+        assert!(has_begun(folder.path()));
     }
 
     #[test]

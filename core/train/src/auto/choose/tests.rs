@@ -2,7 +2,6 @@
 
 use super::stages::slower;
 use super::*;
-use crate::auto::Overlap;
 
 const MACHINE: Machine = Machine { threads: 2, graphics: false, memory: Some(24_000_000_000) };
 
@@ -54,12 +53,16 @@ fn scenes_get_what_they_need_and_no_more() {
     assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
     assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
     let few = chosen(&Facts { cameras: 6, ..facts(Arrangement::Dome) }, MACHINE, 5.0, None);
-    let decay = |cameras: usize, seen_by: Option<usize>| {
+    let of_overlap = |cameras: usize, seen_by: Option<usize>| {
         let overlap = seen_by.map(|cameras| Overlap { compared: 16, cameras, by_three: 0.9, alone: 0.0, apart: Vec::new() });
-        value(&chosen(&Facts { cameras, overlap, ..facts(Arrangement::Dome) }, MACHINE, 5.0, None), "density.decay").and_then(|v| v.as_float())
+        chosen(&Facts { cameras, overlap, ..facts(Arrangement::Dome) }, MACHINE, 5.0, None)
     };
+    let decay = |cameras: usize, seen_by: Option<usize>| value(&of_overlap(cameras, seen_by), "density.decay").and_then(|v| v.as_float());
     let cases = [(4, Some(3)), (10, Some(5)), (16, Some(8)), (18, Some(18)), (16, None), (27, Some(12))];
     assert_eq!(cases.map(|(cameras, seen_by)| decay(cameras, seen_by)), [Some(0.02), Some(0.01), Some(0.01), Some(0.005), Some(0.005), None]);
+    let why = |seen_by| of_overlap(16, seen_by).into_iter().find(|choice| choice.settings[0].0 == "density.decay").unwrap().reason;
+    assert!(why(Some(8)).ends_with("half of what a camera sees is seen by 8 or more of 16 cameras"), "{}", why(Some(8)));
+    assert!(why(None).ends_with("images do not need fade"), "all cameras have one pose");
     assert!(value(&few, "train.dropout").is_some() && value(&dome, "train.dropout").is_none());
     let most = |cameras: usize| value(&chosen(&Facts { cameras, ..facts(Arrangement::Dome) }, MACHINE, 10.0, None), "density.max_gaussians");
     assert_eq!([4, 9, 60].map(most), [6500, 22_000, 37_000].map(|n: i64| Some(n.into())));

@@ -116,6 +116,12 @@ fn yaml_files_have_the_shape_of_their_schedulers() {
     }
 }
 
+#[test]
+fn names_of_jobs_end_in_a_letter_or_digit() {
+    let named = |name: &str| job_name(&Plan { name: name.into(), ..plan() });
+    assert_eq!(["My_Grid.v2", "a_", "_"].map(named), ["cc4dgs-my-grid-v2", "cc4dgs-a", "cc4dgs"]);
+}
+
 /// The words of an `#SBATCH` line, as sbatch reads them (`get_argument` in Slurm's sources).
 fn sbatch_words(line: &str) -> Vec<String> {
     let (mut words, mut word, mut quote, mut escaped): (Vec<String>, String, Option<char>, bool) = Default::default();

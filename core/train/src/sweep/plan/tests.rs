@@ -79,6 +79,26 @@ fn images_of_a_scene_have_one_size_in_any_time() {
 }
 
 #[test]
+fn minutes_need_a_training_that_plans() {
+    let refused = |top: &str, presets: [&str; 2], set_of_second: &str| {
+        let methods = format!("[[method]]\nname = 'a'\npreset = '{}'\n[[method]]\nname = 'b'\npreset = '{}'\n{set_of_second}", presets[0], presets[1]);
+        let text = format!("{top}---{methods}{CODEC}");
+        let all: Vec<PlannedTraining> = trainings(&text).unwrap().into_iter().map(|(training, _)| training).collect();
+        refuse_minutes(&grid(&text), &all, &Registry::collect().unwrap()).map_err(|error| error.to_string())
+    };
+    let (minutes, own) = ("set = ['auto.minutes=7']\n", "set = ['auto.minutes=9']\n");
+    for (top, presets, set) in [(minutes, ["demo", "auto"], ""), ("", ["demo", "auto+hexplane"], own), ("", ["demo", "demo+hexplane"], "")] {
+        assert_eq!(refused(top, presets, set), Ok(()));
+    }
+    for (top, presets, set, part) in
+        [(minutes, ["demo", "demo+hexplane"], "", "set: auto.minutes: 7"), ("", ["auto", "demo"], own, "[[method]] 'b', set: auto.minutes: 9")]
+    {
+        let message = refused(top, presets, set).unwrap_err();
+        assert!(message.starts_with(part) && message.contains("only the preset auto") && message.contains("train.iterations"), "{message}");
+    }
+}
+
+#[test]
 fn mistakes_name_their_place() {
     let wrong = format!("{METHODS}[[setting]]\nname = 'typo'\nset = ['train.iteratons=5']\n{CODEC}");
     let message = trainings(&wrong).unwrap_err().to_string();
