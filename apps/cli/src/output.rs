@@ -12,6 +12,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// The first key of every result: the version of the program that wrote it. Files that begin otherwise are not replaced.
 const MARK: &str = "cc4dgs";
 
+/// What [`is_result`] tells, in words.
+const RESULT: &str = "a result that --json wrote";
+
 /// Where results go.
 pub struct Output {
     json: Option<PathBuf>,
@@ -36,7 +39,7 @@ impl Output {
     /// of its own. Call it before any work.
     pub fn begin(&self) -> Result<()> {
         let Some(file) = self.json_file() else { return Ok(()) };
-        refuse_other_content(file, "a result that --json wrote", is_result)?;
+        refuse_other_content(file, RESULT, is_result)?;
         // A link stays, and leads to nothing until the result is written; devices and pipes stay, too.
         match file.canonicalize() {
             Ok(earlier) if earlier.is_file() => std::fs::remove_file(&earlier).map_err(|e| Error::io(&earlier, e)),
@@ -69,7 +72,9 @@ impl Output {
                         }
                     };
                 }
-                let written = json.and_then(|json| create_parent(path).and_then(|()| write_atomically(path, json.as_bytes())));
+                // The command itself may have made a file of this name meanwhile, such as the plan of a sweep.
+                let free = refuse_other_content(path, RESULT, is_result);
+                let written = free.and(json).and_then(|json| create_parent(path).and_then(|()| write_atomically(path, json.as_bytes())));
                 // What was measured is shown where its file cannot be written, too.
                 print(&text())?;
                 written
@@ -129,6 +134,29 @@ mod tests {
         };
         assert!(Output::new(Some(no_folder.join("out.json")), true).result(&serde_json::json!({ "psnr_db": 30.5 }), text).is_err());
         assert!(shown);
+    }
+
+    #[test]
+    fn what_the_command_made_is_not_replaced_by_its_result() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("plan.json");
+        let output = Output::new(Some(file.clone()), true);
+        output.begin().unwrap();
+        std::fs::write(&file, "{\"trainings\": []}").unwrap();
+        let mut shown = false;
+        let text = || {
+            shown = true;
+            String::new()
+        };
+        let error = output.result(&serde_json::json!({ "cells": 2 }), text).unwrap_err();
+        assert!(shown && error.exit_code() == 2 && error.to_string().contains("plan.json"), "{error}");
+        assert_eq!(std::fs::read_to_string(&file).unwrap(), "{\"trainings\": []}");
+        // An empty file, and an earlier result, which a command such as `demo` may have written, are replaced.
+        for content in ["", "{\"cc4dgs\": \"0.0.9\"}"] {
+            std::fs::write(&file, content).unwrap();
+            output.result(&serde_json::json!({ "cells": 2 }), String::new).unwrap();
+            assert!(std::fs::read_to_string(&file).unwrap().contains("\"cells\": 2"));
+        }
     }
 
     #[cfg(unix)]

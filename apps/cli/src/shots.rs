@@ -15,10 +15,8 @@ pub type Chosen = (Vec<(Camera, f32)>, Option<[f32; 3]>);
 
 /// What to render of `model`; `sets` are scene options. A split without views is an error where `images` are wanted.
 pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model, images: bool) -> Result<Chosen> {
+    check_sets(args, sets)?;
     let Some(path) = &args.scene else {
-        if !sets.is_empty() {
-            return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
-        }
         let standard = Orbit::default();
         let frames = args.frames.map_or(standard.frames, |n| n as usize);
         let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns(), up: args.up().into() };
@@ -36,6 +34,14 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model, i
         (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[view].time_norm)
     };
     Ok((spread_views(&scene, &views, wanted).into_iter().map(shot).collect(), scene.background))
+}
+
+/// Refuses scene options where no dataset is named.
+pub fn check_sets(args: &Shots, sets: &[String]) -> Result<()> {
+    if args.scene.is_some() || sets.is_empty() {
+        return Ok(());
+    }
+    Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"))
 }
 
 /// Refuses the upward axis of an orbit beside the cameras of a dataset.

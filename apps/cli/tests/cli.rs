@@ -61,12 +61,15 @@ fn mistakes_end_with_their_own_exit_code() {
     // Options without effect and wrong names are noticed before anything is read.
     for (args, part) in [
         ("decompress x --no-dynamic --out y.spz", "name a file that ends in .ply"),
+        ("decompress x --out y.glb", "`cc4dgs export gltf`"),
         ("export ply x --frames 3 --out y.ply", "ply-sequence"),
         ("export sog x --fps 3 --out y.sog", "--fps 3: it has no effect on the format sog"),
         ("export splatv x --frames 3 --out y.splatv", "--frames 3: it has no effect on the format splatv"),
         ("export ply-sequence x --fps 3 --out y", "mp4, web"),
         ("export ply x --scene y --out y.ply", "--scene y: it has no effect on the format ply"),
         ("export ply x --set scene.width=8 --out y.ply", "--set scene.width=8: it has no effect on the format ply"),
+        ("export web x --set scene.width=8 --out y.html", "scene options without --scene"),
+        ("decompress x --time 2 --out y.ply", "not in 0..1"),
         ("render x --fps 3 --out y", "--mp4"),
         ("render x --scene y --up=-x --out z", "--up -x: it has no effect on the cameras of --scene"),
         ("report x --images none --views 3", "--views 3: it has no effect on a page without images"),
@@ -90,6 +93,13 @@ fn mistakes_end_with_their_own_exit_code() {
     ] {
         let said = fail(&args.split(' ').collect::<Vec<_>>(), 2);
         assert!(said.contains(part), "{args}: {said}");
+    }
+    // So is what would be replaced.
+    let kept = folder.path().join("kept.ply");
+    std::fs::write(&kept, "mine").unwrap();
+    for command in [&["export", "ply"][..], &["decompress"]] {
+        let said = fail(&[command, &["no/such/model", "--out", text(&kept)]].concat(), 2);
+        assert!(said.contains("kept.ply") && said.contains("--overwrite"), "{said}");
     }
     #[cfg(unix)]
     {

@@ -7,9 +7,9 @@ the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
 from browser_destroy import destroyed
-from browser_faults import broken_module, fetched_meanwhile, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
+from browser_faults import broken_module, fetched_meanwhile, few_degrees, half_arrived, hopeless, missing_files, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
 from browser_gaussian import one_gaussian, remarks
-from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, low, reduced_motion, touch, wheel
+from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, layouts, low, reduced_motion, touch, wheel
 from browser_keep import frames, reloaded, several, shapes
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
@@ -84,6 +84,7 @@ def main():
         navigation(pages, page)
         wheel(page)
         command_key(page)
+        layouts(page)
         held(page)
         cameras(page)
         key_list(page)
@@ -107,6 +108,7 @@ def main():
         destroyed(pages, facts)
         hopeless(pages)
         broken_module(pages)
+        missing_files(pages)
         drop(page, facts)
         pages.quiet("dropping")
         page.close()

@@ -222,6 +222,31 @@ def hopeless(pages):
     say("a model that loses the device each time is given up")
 
 
+def missing_files(pages):
+    """A page without its modules is a sentence, and so is an archive that arrives in part."""
+    for name in ("player.js", "cc4dgs_player.js"):
+        page = pages.watch(pages.browser.new_page())
+        page.route(f"**/{name}", lambda route: route.fulfill(status=404, body="not found"))
+        page.goto(f"{pages.address}/index.html")
+        page.wait_for_function("document.body.innerText.includes('could not be loaded')")
+        said = page.evaluate("document.body.innerText")
+        assert "player.js" in said and "beside the page" in said, said
+        page.close()
+    # The browser itself logs the missing file, and the module that fails for it.
+    pages.complaints[:] = [c for c in pages.complaints if "404" not in c and "dynamically imported" not in c]
+    pages.quiet("missing modules")
+    say(f"a page without its modules says: {said}")
+    page = pages.open()
+    message = page.evaluate("""async source => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
+        window.fetch = async () => new Response(bytes.slice(0, bytes.length / 2), { headers: { "Content-Length": String(bytes.length) } });
+        const told = await cc4dgs.load("/part.cc4d").then(() => "it loaded", e => e.message);
+        window.fetch = fetch;
+        return told; }""", MODEL)
+    assert message.startswith("part.cc4d arrived in part"), message
+    page.close()
+    pages.quiet("a model that arrives in part")
+
+
 def broken_module(pages):
     """Where the module could not be fetched, another player fetches it."""
     page = pages.watch(pages.browser.new_page())

@@ -66,6 +66,22 @@ def command_key(page):
     say("keys are not held any more once Cmd is")
 
 
+def layouts(page):
+    """Letters have their positions on layouts without Latin letters, else what they type."""
+    send = "([name, key, code]) => document.body.dispatchEvent(new KeyboardEvent(name, { key, code, bubbles: true, cancelable: true }))"
+    for key, code, flies in (("ц", "KeyW", True), ("Ц", "KeyW", True), ("w", "KeyZ", True), ("ц", "", False)):
+        page.evaluate(send, ["keydown", key, code])
+        assert page.evaluate("cc4dgs.flyKeys(0)") == flies, f"{key} at {code} {'does not fly' if flies else 'flies'}"
+        # The layout was changed meanwhile.
+        page.evaluate(send, ["keyup", "x", code])
+        assert not page.evaluate("cc4dgs.flyKeys(0)"), f"{key} at {code} flies on"
+    for key, code in (("а", "KeyF"), ("f", "KeyY")):
+        before = page.evaluate("cc4dgs.flying")
+        page.evaluate(send, ["keydown", key, code])
+        assert page.evaluate("cc4dgs.flying") != before, f"{key} at {code} switches nothing"
+    say("letters act on keyboards without Latin letters, too")
+
+
 def held(page):
     """A key that is held down switches once, and steps again and again."""
     key = "([key, repeat]) => document.body.dispatchEvent(new KeyboardEvent('keydown', { key, repeat, bubbles: true, cancelable: true }))"

@@ -232,7 +232,7 @@ export function build(container, player) {
         title: text => { title.textContent = text; if (!embedded) document.title = `${text} – cc4dgs player`; },
         error: text => say(text, true),
         note: text => say(text, false),
-        loading: on => { progress.hidden = !on; if (on) { progress.style.width = "2%"; if (!player.facts) say("Loading …"); } },
+        loading: on => { progress.hidden = !on; if (on) { progress.style.width = "2%"; progress.removeAttribute("aria-valuenow"); if (!player.facts) say("Loading …"); } },
         progress: share => { const percent = Math.round(100 * Math.min(share, 1)); progress.style.width = `${percent}%`; progress.setAttribute("aria-valuenow", percent); },
         poster: bytes => {
             if (poster.src) URL.revokeObjectURL(poster.src);

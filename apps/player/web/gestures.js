@@ -80,32 +80,42 @@ export function commandsOf(player, act) {
     };
 }
 
+/// What a key is called here: what it types, letters in lower case, or its name. On layouts without Latin letters it has the letter of its position (`code`), as in
+/// the window of `cc4dgs view`.
+function nameOfKey({ key, code }) {
+    if (key.length !== 1) return key;
+    const letter = /^[!-~ ]$/.test(key) ? key : /^Key([A-Z])$/.exec(code)?.[1] ?? key;
+    return letter.toLowerCase();
+}
+
 /// Keys, until `signal` aborts: held ones fly, others are commands by name. Returns a function that moves by the keys that are held for so many seconds; whether any
 /// were.
 export function addKeys(element, act, commands, signal) {
-    const held = new Set();
+    // Names of the keys that are held, by position: the layout may change meanwhile, and with it what a key types.
+    const held = new Map();
+    const positionOf = e => e.code || nameOfKey(e);
     const listen = (target, name, run) => target.addEventListener(name, run, { signal });
     listen(element, "keydown", e => {
         // macOS tells of no key that is released while Cmd is held.
         if (e.metaKey) held.clear();
         // Another player, inside of this one's page, has acted on it.
         if (e.defaultPrevented || e.ctrlKey || e.metaKey || e.altKey) return;
-        const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
+        const key = nameOfKey(e);
         // Lists choose by letters.
         if (key !== "Escape" && e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
-        if (FLY[key]) { held.add(key); e.preventDefault(); return; }
+        if (FLY[key]) { held.set(positionOf(e), key); e.preventDefault(); return; }
         // Sliders keep the keys that move them, buttons and boxes those that press them.
         const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input, summary") && (key === " " || key === "Enter");
         if (!commands[key] || own) return;
         if (!e.repeat || !ONCE.has(key)) commands[key]();
         e.preventDefault();
     });
-    listen(element, "keyup", e => { if (e.key === "Meta") held.clear(); else held.delete(e.key.toLowerCase()); });
+    listen(element, "keyup", e => { if (e.key === "Meta") held.clear(); else held.delete(positionOf(e)); });
     listen(element, "focusout", () => held.clear());
     // Where nothing has the focus, nothing loses it with the window.
     listen(window, "blur", () => held.clear());
     return seconds => {
-        for (const key of held) act.fly(...FLY[key].map(v => v * seconds));
+        for (const key of new Set(held.values())) act.fly(...FLY[key].map(v => v * seconds));
         return held.size > 0;
     };
 }

@@ -57,6 +57,7 @@ async function drain(name, response, offset, sink) {
 class Progress {
     constructor(wasm, name, total, show) {
         this.download = new wasm.Download(name, total);
+        this.name = name;
         this.show = show;
         this.total = total;
         this.arrived = 0;
@@ -115,7 +116,7 @@ class Progress {
         return degree === ALL || now - this.waiting.since >= this.took;
     }
     finish() {
-        if (!this.shown.motion || this.shown.degree < ALL) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
+        if (!this.shown.motion || this.shown.degree < ALL) throw new Error(`${this.name} arrived in part: ${this.arrived} of ${this.total} bytes. Load it again; where that does not help, check the file on its server.`);
     }
 }
 

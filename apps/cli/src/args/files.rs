@@ -9,7 +9,7 @@ pub struct Decompress {
     /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
-    /// The file to write: PLY in the layout of 3DGS, or Niantic's SPZ where it ends in .spz.
+    /// The file to write: PLY in the layout of 3DGS, or Niantic's SPZ where it ends in .spz. Endings of other formats of `export` are refused.
     #[arg(long, value_name = "F.ply|F.spz")]
     pub out: PathBuf,
     /// Replace the file where it exists.

@@ -195,8 +195,7 @@ fn check_device(context: &Context, device_name: &'static str, device: &Device, t
             let (max, gradient, problem) = match &drawn {
                 Err(e) => (None, None, Some(e.to_string())),
                 Ok(drawn) => {
-                    // A value that is not a number must fail: `max` would drop it.
-                    let max = truth.image.iter().zip(&drawn.image).map(|(a, b)| (a - b).abs()).fold(0.0f32, |m, d| if d <= m { m } else { d });
+                    let max = largest_difference(&truth.image, &drawn.image);
                     let gradient = relative(&truth.gradient, &drawn.gradient);
                     let close = max <= TOLERANCE && gradient <= GRADIENT_TOLERANCE;
                     let problem = || format!("a pixel differs by {max} ({TOLERANCE} is allowed), the gradient by {gradient} ({GRADIENT_TOLERANCE})");
@@ -207,6 +206,11 @@ fn check_device(context: &Context, device_name: &'static str, device: &Device, t
             Check { device: device_name, rasterizer: name.to_string(), max_difference: finite(max), gradient_difference: finite(gradient), ms, problem }
         })
         .collect()
+}
+
+/// NaN where a difference is no number, wherever it is: this must fail, and `f32::max` would drop it.
+fn largest_difference(truth: &[f32], found: &[f32]) -> f32 {
+    truth.iter().zip(found).map(|(a, b)| (a - b).abs()).max_by(f32::total_cmp).unwrap_or(0.0)
 }
 
 fn relative(truth: &[f32], found: &[f32]) -> f32 {
@@ -271,4 +275,19 @@ pub fn cpu_features() -> Vec<&'static str> {
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
 pub fn cpu_features() -> Vec<&'static str> {
     Vec::new()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_that_are_no_numbers_fail_wherever_they_are() {
+        assert_eq!(largest_difference(&[0.5, 0.5, 0.5], &[0.5, 0.25, 0.375]), 0.25);
+        for at in 0..3 {
+            let mut found = [0.5, 0.25, 0.5];
+            found[at] = f32::NAN;
+            assert!(largest_difference(&[0.5; 3], &found).is_nan(), "pixel {at}");
+        }
+    }
 }

@@ -6,6 +6,7 @@ use crate::ignored::{Stated, refuse_ignored, written};
 use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::export::{ExportJob, ExportRequest, check_time};
+use cc4dgs_core::exporter::check_target;
 use cc4dgs_core::{Error, ExportTarget, ExporterPlugin, Registry, Result, config, plural};
 use cc4dgs_play::source::{Source, SourceKind};
 use std::path::Path;
@@ -19,14 +20,18 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     context.registry.build_exporter(&args.format, &settings)?;
     check_name(&args.out, plugin.target, &args.format)?;
     check_options(&context.registry, plugin, args, &scene_sets)?;
+    shots::check_sets(&args.shots, &scene_sets)?;
     check_time(&context.registry, plugin, args.time)?;
+    check_target(&args.out, plugin.target, args.overwrite)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let images = plugin.info.capabilities.contains(&"images");
-    let (shots, background) = match shots::choose(context, &args.shots, &scene_sets, &loaded.model, images) {
+    // For formats that draw no image and begin at no camera, a dataset would be opened for nothing.
+    let (shots, background) = match has_one(plugin, &["camera", "images"]).then(|| shots::choose(context, &args.shots, &scene_sets, &loaded.model, images)) {
+        None => (Vec::new(), None),
         // Formats of Gaussians are written for models that no orbit can look at, too.
-        Err(Error::Data { .. }) if args.shots.scene.is_none() => (Vec::new(), None),
-        chosen => chosen?,
+        Some(Err(Error::Data { .. })) if args.shots.scene.is_none() => (Vec::new(), None),
+        Some(chosen) => chosen?,
     };
     let cameras = match &args.shots.scene {
         Some(scene) if plugin.info.capabilities.contains(&"player") => shots::capture_cameras(context, scene, &scene_sets, &loaded.model)?,

@@ -7,7 +7,7 @@ use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::video::{self, VideoWriter};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Camera, Error, Event, EventSink, Result, plural};
+use cc4dgs_core::{Error, Event, EventSink, Result, plural};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::images::write_png;
 use serde::Serialize;
@@ -45,7 +45,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let (shots, background) = shots::choose(context, &args.shots, &args.sets, &loaded.model, true)?;
     if let Some(path) = &args.mp4 {
-        check_sizes(&shots)?;
+        video::check_sizes("--mp4", &shots)?;
         create_parent(path)?;
     }
     image_folder::begin(&args.out, &earlier)?;
@@ -89,15 +89,6 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     })
 }
 
-/// Refuses a video of images of several sizes, before any is drawn.
-fn check_sizes(shots: &[(Camera, f32)]) -> Result<()> {
-    let mut sizes = shots.iter().map(|(camera, _)| [camera.width, camera.height]);
-    let first = sizes.next();
-    let Some(([w, h], [width, height])) = first.zip(sizes.find(|size| Some(*size) != first)) else { return Ok(()) };
-    let problem = format!("there are images of {w}x{h} and of {width}x{height} pixels, and those of a video have one size");
-    Err(Error::parameter("--mp4", problem, "Give all images one size (--size), or leave the video out"))
-}
-
 /// The frames that an earlier command left in `folder`, by their names. They are refused without `overwrite`; with it, where no command marked the folder: they
 /// may be images of a dataset.
 fn earlier_frames(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
@@ -116,16 +107,6 @@ fn earlier_frames(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn images_of_a_video_have_one_size() {
-        let shots = |sizes: &[(u32, u32)]| -> Vec<(Camera, f32)> {
-            sizes.iter().map(|&size| (Camera::look_at("a", size, 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]), 0.0)).collect()
-        };
-        assert!(check_sizes(&[]).is_ok() && check_sizes(&shots(&[(80, 60); 3])).is_ok());
-        let message = check_sizes(&shots(&[(80, 60), (80, 60), (60, 80)])).unwrap_err().to_string();
-        assert!(message.contains("80x60 and of 60x80") && message.contains("--size"), "{message}");
-    }
 
     #[test]
     fn frames_replace_frames_only() {

@@ -35,7 +35,8 @@ impl Storage {
             row("deform net", self.field.map(|f| f.1), None),
             row("deform", deform, self.stored.map(|s| s[0])),
             row("point cloud", Some(self.point_cloud), self.stored.map(|s| s[1])),
-            row("total", deform.map(|d| d + self.point_cloud), self.stored.map(|s| s[2])),
+            // An archive may claim any number of floats per Gaussian.
+            row("total", deform.map(|d| d.saturating_add(self.point_cloud)), self.stored.map(|s| s[2])),
         ]
     }
 }
@@ -48,4 +49,16 @@ pub fn table(rows: &[StorageRow]) -> Vec<String> {
         format!("{:<14}{:>12}{:>12}", r.part, cell(r.float32_mb, "-"), cell(r.stored_mb, ""))
     }));
     lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn totals_of_absurd_claims_are_not_small() {
+        let total = |point_cloud| Storage { field: Some((10_000_000, 5_000_000)), point_cloud, stored: None }.rows()[4].float32_mb;
+        assert_eq!(total(1_000_000), Some(16.0));
+        assert_eq!(total(u64::MAX), Some(megabytes(u64::MAX)));
+    }
 }

@@ -40,13 +40,7 @@ pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> 
     let minutes = args.minutes.map(|minutes| format!("auto.minutes={minutes}"));
     let sets: Vec<String> = args.sets.iter().cloned().chain(minutes).collect();
     let layers = layers(context, preset, file, &sets, args.device.as_deref())?;
-    if args.minutes.is_some() && !layers.want_plan() {
-        return Err(Error::parameter(
-            "--minutes",
-            "only the preset auto plans for a time",
-            "Leave --preset, --config and --resume out, or set train.iterations",
-        ));
-    }
+    refuse_minutes(&sets, args.minutes.is_some(), &layers)?;
     let existing = match (args.resume, args.overwrite) {
         (true, _) => Existing::Resume,
         (false, true) => Existing::Overwrite,
@@ -72,9 +66,22 @@ pub fn layers(context: &Context, preset: Option<&str>, file: Option<&Path>, sets
     Layers::collect(&context.registry, preset, file, &sets)
 }
 
+/// Refuses the time of a training among `sets`, which is that of --minutes where this is `stated`, where `layers` ask for no plan.
+fn refuse_minutes(sets: &[String], stated: bool, layers: &Layers) -> Result<()> {
+    let Some(set) = assignment(sets, "auto.minutes").filter(|_| !layers.want_plan()) else { return Ok(()) };
+    let object = if stated { "--minutes".into() } else { format!("--set {set}") };
+    let remedy = "Leave --preset, --config and --resume out, or set train.iterations";
+    Err(Error::parameter(object, "only the preset auto plans for a time", remedy))
+}
+
+/// The first of `sets` that assigns to `key`.
+fn assignment<'a>(sets: &'a [String], key: &str) -> Option<&'a String> {
+    sets.iter().find(|set| set.split_once('=').is_some_and(|(name, _)| name.trim() == key))
+}
+
 /// Refuses the setting `key` among `sets` where an option of the command line, `option`, is stated, which takes its place.
 fn refuse_overruled(sets: &[String], key: &str, option: &str, stated: bool) -> Result<()> {
-    let value = sets.iter().find(|set| set.split_once('=').is_some_and(|(name, _)| name.trim() == key)).cloned();
+    let value = assignment(sets, key).cloned();
     refuse_ignored(&format!("a command with {option}"), [Stated { option: "--set", value, used: !stated, remedy: "Leave one of the two out".into() }])
 }
 
@@ -126,6 +133,21 @@ pub fn text(report: &TrainReport) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_time_needs_a_plan() {
+        let registry = cc4dgs_core::Registry::collect().unwrap();
+        let refused = |preset: &str, set: &str, stated| {
+            let sets = vec![set.to_string()];
+            let layers = Layers::collect(&registry, Some(preset), None, &sets).unwrap();
+            refuse_minutes(&sets, stated, &layers).map_err(|error| error.to_string())
+        };
+        assert_eq!((refused("auto+hexplane", "auto.minutes=3", false), refused("demo", "seed=3", false)), (Ok(()), Ok(())));
+        for (stated, object) in [(true, "--minutes: "), (false, "--set auto.minutes=3: ")] {
+            let message = refused("demo", "auto.minutes=3", stated).unwrap_err();
+            assert!(message.starts_with(object) && message.contains("only the preset auto") && message.contains("train.iterations"), "{message}");
+        }
+    }
 
     #[test]
     fn settings_that_an_option_replaces_are_refused() {

@@ -52,7 +52,8 @@ impl Uploaded {
         let largest = words.map(|w| 4 * w as u64).into_iter().chain([SPLAT_BYTES * n]);
         if let Some(bytes) = largest.max().filter(|b| *b > most) {
             let fits = n * most / bytes.max(1);
-            return Err(Error::limit("largest buffer of the model, in bytes", bytes, most, format!("This device holds about {fits} such Gaussians")));
+            let remedy = format!("This device holds about {fits} such Gaussians: remove some with `cc4dgs prune`, or open a smaller model");
+            return Err(Error::limit("largest buffer of the model, in bytes", bytes, most, remedy));
         }
         let most_blocks = u64::from(device.limits().max_compute_workgroups_per_dimension);
         if n.div_ceil(u64::from(BLOCK)) > most_blocks {
