@@ -4,7 +4,8 @@
 pub mod golden;
 
 use burn::tensor::{Device, Tensor};
-use cc4dgs_core::parse_device;
+use cc4dgs_core::{Event, EventSink, parse_device};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 /// The devices every suite runs on: the CPU's, and wgpu where an adapter answers (Mesa's lavapipe is enough).
 pub fn devices() -> Vec<(&'static str, Device)> {
@@ -21,6 +22,22 @@ pub fn devices() -> Vec<(&'static str, Device)> {
 /// The larger of two numbers. One that is no number stays, where `f32::max` leaves it out, so that no assertion about the largest of many holds.
 pub fn larger<T: PartialOrd + Copy>(a: T, b: T) -> T {
     if a.partial_cmp(&a).is_none() || a >= b { a } else { b }
+}
+
+/// Sets the stop flag at the n-th iteration event.
+pub struct StopAfter<'a> {
+    /// Events that are left.
+    pub left: AtomicUsize,
+    /// The flag.
+    pub stop: &'a AtomicBool,
+}
+
+impl EventSink for StopAfter<'_> {
+    fn emit(&self, event: &Event) {
+        if matches!(event, Event::Iteration { .. }) && self.left.fetch_sub(1, Ordering::Relaxed) == 1 {
+            self.stop.store(true, Ordering::Relaxed);
+        }
+    }
 }
 
 /// Fills the device's free memory with NaNs, so that tests detect kernels that read uninitialised memory.

@@ -6,6 +6,7 @@ use cc4dgs_core::{Error, Event, EventSink, Limits, PresetRole, Recorder, Registr
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::player::Player;
 use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_tests::StopAfter;
 use cc4dgs_train::agreement::agreement;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
@@ -51,20 +52,6 @@ fn load(path: &Path) -> Model {
 fn score(model: &Model, config: &RunConfig) -> EvalReport {
     let registry = Registry::collect().unwrap();
     evaluate(model, &open(config), Scored::all(Split::Test), &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap()
-}
-
-/// Sets the stop flag at the n-th iteration event.
-struct StopAfter<'a> {
-    left: AtomicUsize,
-    stop: &'a AtomicBool,
-}
-
-impl EventSink for StopAfter<'_> {
-    fn emit(&self, event: &Event) {
-        if matches!(event, Event::Iteration { .. }) && self.left.fetch_sub(1, Ordering::Relaxed) == 1 {
-            self.stop.store(true, Ordering::Relaxed);
-        }
-    }
 }
 
 #[test]

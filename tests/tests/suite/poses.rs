@@ -4,14 +4,15 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs::{Session, deformers as _, parts as _};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, Error, Event, EventSink, Parameter, ParameterGroup, Part, Plugin, Posed, Poses, PosesContext, PosesPlugin, Registry, Result, Scene, Seed, Split,
-    conformance, toml,
+    Camera, Error, Event, Parameter, ParameterGroup, Part, Plugin, Posed, Poses, PosesContext, PosesPlugin, Registry, Result, Scene, Seed, Split, conformance,
+    toml,
 };
+use cc4dgs_tests::StopAfter;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::train::{TrainJob, train};
 use glam::{DMat3, DVec3};
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::sync::{Arc, Mutex};
 
 /// Radians by which cameras are turned, and units of the scene by which they are moved, about.
@@ -73,20 +74,6 @@ fn cameras_that_stand_elsewhere_are_found() {
     let (with, said) = trained("poses.kind=refined", 800);
     assert!(with > without + 4.0, "held-out cameras: {without} dB with the displaced poses, {with} with corrected ones");
     assert!(silent.is_none() && said.is_some_and(|said| said.contains("degrees")), "the run does not say what it corrected");
-}
-
-/// Sets the stop flag at the n-th iteration event.
-struct StopAfter<'a> {
-    left: AtomicUsize,
-    stop: &'a AtomicBool,
-}
-
-impl EventSink for StopAfter<'_> {
-    fn emit(&self, event: &Event) {
-        if matches!(event, Event::Iteration { .. }) && self.left.fetch_sub(1, Ordering::Relaxed) == 1 {
-            self.stop.store(true, Ordering::Relaxed);
-        }
-    }
 }
 
 #[test]

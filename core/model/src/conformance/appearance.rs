@@ -1,8 +1,8 @@
 //! The conformance suite of appearance models.
 
-use super::{guarded, settings_are_defaults, uniform, within};
+use super::{guarded, settings_are_defaults, uniform, weights, within};
 use crate::gaussians::to_vec;
-use crate::{Appearance, AppearanceContext, AppearancePlugin, Parameter, Result, Seed, check_parameters};
+use crate::{Appearance, AppearanceContext, AppearancePlugin, Result, Seed, check_parameters};
 use burn::tensor::{Device, Tensor, TensorData};
 
 /// Planes of the suite `[5,H,W]`.
@@ -53,8 +53,7 @@ impl Suite<'_> {
     fn settings_are_read(&self) -> Result<Option<String>> {
         settings_are_defaults("appearance", &self.plugin.info, self.settings, |settings| {
             let built = Suite { plugin: self.plugin, settings, device: self.device }.shaken(self.device)?;
-            let weights = |p: &&Parameter| Ok((p.name.clone(), p.shape.clone(), to_vec(p.value.clone(), &p.name)?));
-            let weights = built.parameters().iter().map(weights).collect::<Result<Vec<_>>>()?;
+            let weights = weights::values(&built.parameters())?;
             let term = built.regularizer()?.map(|term| to_vec(term, "regularizer")).transpose()?;
             Ok((weights, built.groups(), term))
         })
@@ -64,13 +63,7 @@ impl Suite<'_> {
     }
     fn shaken(&self, device: &Device) -> Result<Box<dyn Appearance>> {
         let mut built = self.fresh(device)?;
-        for (index, parameter) in built.parameters_mut().into_iter().enumerate() {
-            let seed = Seed::root(65).index(index as u64);
-            let moved: Vec<f32> = to_vec(parameter.value.clone(), "weights")?.iter().enumerate().map(|(k, v)| v + SHAKE * uniform(seed, k)).collect();
-            let n = moved.len();
-            let value = Tensor::<1>::from_data(TensorData::new(moved, [n]), device);
-            parameter.value = if value.is_autodiff() { value.require_grad() } else { value };
-        }
+        weights::change(built.parameters_mut(), device, |index, k| SHAKE * uniform(Seed::root(65).index(index as u64), k))?;
         Ok(built)
     }
     fn planes(&self, values: Vec<f32>, device: &Device) -> Tensor<3> {
@@ -119,26 +112,9 @@ impl Suite<'_> {
         let slope = |ends: [f64; 2], step: f64| (ends[0] - ends[1]) / (2.0 * step);
         let number = |t: Tensor<1>| -> Result<f64> { Ok(to_vec(t, "value")?.first().map_or(f64::NAN, |v| f64::from(*v))) };
         let step = 2e-2;
-        for index in 0..built.parameters().len() {
-            let (name, start, gradient) = {
-                let p = built.parameters()[index];
-                let Some(gradient) = p.value.grad(&gradients) else { return Ok(Some(format!("no gradient reaches {}", p.name))) };
-                (p.name.clone(), to_vec(p.value.clone(), "weights")?, to_vec(gradient, "gradient")?)
-            };
-            let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-            let mut ends = [0.0; 2];
-            for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
-                let moved: Vec<f32> = start.iter().zip(&gradient).map(|(s, g)| s + (sign * step * f64::from(*g) / norm) as f32).collect();
-                let count = moved.len();
-                built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(moved, [count]), &device);
-                *end = number(measure(built.as_ref(), planes.clone())?)?;
-            }
-            let count = start.len();
-            built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(start, [count]), &device);
-            let found = slope(ends, step);
-            if norm == 0.0 || !within(found / norm - 1.0, SLOPE_TOLERANCE) {
-                return Ok(Some(format!("{name}: the loss rises by {found:.5} per unit along its gradient of norm {norm:.5}")));
-            }
+        let of_weights = |model: &(dyn Appearance + 'static)| number(measure(model, planes.clone())?);
+        if let Some(finding) = weights::slopes(built.as_mut(), |m| m.parameters(), |m| m.parameters_mut(), (&gradients, step), of_weights)? {
+            return Ok(Some(finding));
         }
         let Some(gradient) = planes.grad(&gradients) else { return Ok(Some("no gradient reaches the planes".into())) };
         let gradient = to_vec(gradient, "gradient")?;

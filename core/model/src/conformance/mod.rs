@@ -12,6 +12,7 @@ mod poses;
 mod preset;
 mod rasterizer;
 mod reader;
+mod weights;
 
 pub use appearance::appearance;
 #[cfg(not(target_arch = "wasm32"))]

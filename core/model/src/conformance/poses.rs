@@ -1,20 +1,16 @@
 //! The conformance suite of pose models.
 
-use super::{guarded, settings_are_defaults, uniform, within};
+use super::{guarded, settings_are_defaults, uniform, weights, within};
 use crate::gaussians::to_vec;
-use crate::{Camera, Parameter, Posed, Poses, PosesContext, PosesPlugin, Result, Seed, check_parameters};
+use crate::{Camera, Posed, Poses, PosesContext, PosesPlugin, Result, Seed, check_parameters};
 use burn::tensor::{Device, Tensor, TensorData};
 
 /// Training cameras.
 const CAMERAS: usize = 4;
 /// Extent of the cameras.
 const EXTENT: f64 = 2.5;
-/// Largest relative difference between a finite difference along the gradient and the gradient's norm.
-const SLOPE_TOLERANCE: f64 = 0.02;
 /// Size of the random changes of the weights.
 const SHAKE: f32 = 0.1;
-/// The most numbers of an array by which single finite differences are taken.
-const NUMBERS: usize = 24;
 /// Size of the finite differences.
 const STEP: f64 = 1e-3;
 /// Largest error of a rotation, of an unchanged pose, and of the mean motion of the cameras.
@@ -61,15 +57,15 @@ fn pose(poses: &dyn Poses, index: usize) -> Result<[[f64; 4]; 4]> {
 }
 
 fn largest_difference(a: &[[f64; 4]; 4], b: &[[f64; 4]; 4]) -> f64 {
-    a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, |most, d| if d.is_nan() { f64::NAN } else { most.max(d) })
+    // NaN is the largest, and stays.
+    a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| (a - b).abs()).max_by(f64::total_cmp).unwrap_or(0.0)
 }
 
 impl Suite<'_> {
     fn settings_are_read(&self) -> Result<Option<String>> {
         settings_are_defaults("poses", &self.plugin.info, self.settings, |settings| {
             let built = Suite { plugin: self.plugin, settings, device: self.device }.shaken(self.device)?;
-            let weights = |p: &&Parameter| Ok((p.name.clone(), p.shape.clone(), to_vec(p.value.clone(), &p.name)?));
-            let weights = built.parameters().iter().map(weights).collect::<Result<Vec<_>>>()?;
+            let weights = weights::values(&built.parameters())?;
             let term = built.regularizer()?.map(|term| to_vec(term, "regularizer")).transpose()?;
             Ok((weights, built.groups(), term))
         })
@@ -80,12 +76,7 @@ impl Suite<'_> {
     /// A model whose weights are those of a new one, changed by `change` of the array and the number in it.
     fn changed(&self, device: &Device, change: impl Fn(usize, usize) -> f32) -> Result<Box<dyn Poses>> {
         let mut built = self.fresh(device)?;
-        for (index, parameter) in built.parameters_mut().into_iter().enumerate() {
-            let moved: Vec<f32> = to_vec(parameter.value.clone(), "weights")?.iter().enumerate().map(|(k, v)| v + change(index, k)).collect();
-            let n = moved.len();
-            let value = Tensor::<1>::from_data(TensorData::new(moved, [n]), device);
-            parameter.value = if value.is_autodiff() { value.require_grad() } else { value };
-        }
+        weights::change(built.parameters_mut(), device, change)?;
         Ok(built)
     }
     fn shaken(&self, device: &Device) -> Result<Box<dyn Poses>> {
@@ -171,34 +162,6 @@ impl Suite<'_> {
             total = total + term;
         }
         let gradients = total.backward();
-        for index in 0..built.parameters().len() {
-            let (name, start, gradient) = {
-                let p = built.parameters()[index];
-                let Some(gradient) = p.value.grad(&gradients) else { return Ok(Some(format!("no gradient reaches {}", p.name))) };
-                (p.name.clone(), to_vec(p.value.clone(), "weights")?, to_vec(gradient, "gradient")?)
-            };
-            let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-            let count = start.len();
-            // Along the gradient, which shows errors of its size, and by single numbers, which shows those that are missing in it.
-            let along: Vec<f64> = gradient.iter().map(|g| f64::from(*g) / norm).collect();
-            let single = (0..count).step_by(count.div_ceil(NUMBERS).max(1)).map(|number| (0..count).map(|k| f64::from(u8::from(k == number))).collect());
-            for direction in std::iter::once(along).chain(single) {
-                let mut ends = [0.0; 2];
-                for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
-                    let moved: Vec<f32> = start.iter().zip(&direction).map(|(s, d)| s + (sign * STEP * d) as f32).collect();
-                    built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(moved, [count]), &device);
-                    *end = measure(built.as_ref())?;
-                }
-                built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(start.clone(), [count]), &device);
-                let found = (ends[0] - ends[1]) / (2.0 * STEP);
-                let expected: f64 = gradient.iter().zip(&direction).map(|(g, d)| f64::from(*g) * d).sum();
-                if norm == 0.0 || !within((found - expected) / norm, SLOPE_TOLERANCE) {
-                    let said =
-                        format!("{name}: the loss rises by {found:.5} per unit along a direction where its gradient of norm {norm:.5} says {expected:.5}");
-                    return Ok(Some(said));
-                }
-            }
-        }
-        Ok(None)
+        weights::slopes(built.as_mut(), |m| m.parameters(), |m| m.parameters_mut(), (&gradients, STEP), |m| measure(m))
     }
 }
