@@ -70,7 +70,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
             plural(plans.len(), "camera", "cameras")
         ));
     }
-    let videos = VideoFrames::new(&raw.views, &plans, options)?;
+    let videos = VideoFrames::new(&raw.views, &plans, options, limits)?;
     let jobs = raw.views.iter().map(|v| Job { image: Some(v.image.clone()), plan: v.camera }).collect();
     let mask = |image: &ImageSource| match image {
         ImageSource::File { mask: Some(path), .. } if path.is_file() => Some(ImageSource::file(path)),

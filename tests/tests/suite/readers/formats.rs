@@ -183,7 +183,8 @@ fn llff_with_videos() {
     let log = tools.path().join("log");
     let body = "for last; do :; done\nout=$(dirname \"$last\")\ncam=$(echo \"$*\" | grep -o 'cam0[0-9]' | head -1)\n";
     let copy = "i=1\nfor t in 1 3 5; do cp TOOLS/$cam/$t.png $out/$(printf %06d $i).png; i=$((i+1)); done\n".replace("TOOLS", &tools.path().to_string_lossy());
-    let ffmpeg = script("ffmpeg", format!("#!/bin/sh\necho \"$*\" >> {}\n{body}{copy}", log.display()));
+    let times = "for t in 0 1 2 3 4 5; do echo \"frame:$t pts:${t}000000 pts_time:$t\"; done\n";
+    let ffmpeg = script("ffmpeg", format!("#!/bin/sh\necho \"$*\" >> {}\n{body}{copy}{times}", log.display()));
     let options = SceneOptions { ffmpeg, frames: Some([1, 3, 2]), video_cache: Some(tools.path().join("cache")), ..Default::default() };
     let scene = open(dir.path(), &options, &Limits::default()).unwrap();
     assert_eq!(scene.frame_count, 3);

@@ -5,6 +5,7 @@ mod colmap;
 pub mod common;
 mod conformance;
 mod course;
+mod damaged_videos;
 mod depth;
 mod first_points;
 mod formats;

@@ -8,11 +8,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-const SIZE: (u32, u32) = (64, 48);
+pub(super) const SIZE: (u32, u32) = (64, 48);
 const BITS: u32 = 10;
 
 /// Whether ffmpeg is here.
-fn ffmpeg() -> bool {
+pub(super) fn ffmpeg() -> bool {
     let here =
         ["ffmpeg", "ffprobe"].iter().all(|c| Command::new(c).arg("-version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success()));
     assert!(here || std::env::var_os("CC4DGS_REQUIRE_FFMPEG").is_none(), "the ffmpeg and ffprobe commands are absent");
@@ -23,7 +23,7 @@ fn ffmpeg() -> bool {
 }
 
 /// Runs ffmpeg on `arguments`.
-fn encode(arguments: &[&str], out: &Path) {
+pub(super) fn encode(arguments: &[&str], out: &Path) {
     let output = Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-y"]).args(arguments).arg(out).stdin(Stdio::null()).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
@@ -47,7 +47,7 @@ fn path(count: usize) -> Vec<u32> {
 }
 
 /// A video of the given instants. Each camera sees the box at another height, every second one mirrored. The upper left corner is bright.
-fn record(out: &Path, camera: usize, instants: &[usize], rate: &str, more: &[&str]) {
+pub(super) fn record(out: &Path, camera: usize, instants: &[usize], rate: &str, more: &[&str]) {
     let motion = path(1 << BITS);
     let frames = tempfile::tempdir().unwrap();
     for (index, &instant) in instants.iter().enumerate() {
@@ -79,7 +79,7 @@ fn instant(image: &Image8) -> usize {
 }
 
 /// Per frame the instants that the cameras show, in their order.
-fn instants(scene: &Scene) -> BTreeMap<usize, Vec<Option<usize>>> {
+pub(super) fn instants(scene: &Scene) -> BTreeMap<usize, Vec<Option<usize>>> {
     let mut found: BTreeMap<usize, Vec<Option<usize>>> = BTreeMap::new();
     for (view, v) in scene.views.iter().enumerate() {
         found.entry(v.frame).or_insert_with(|| vec![None; scene.cameras.len()])[v.camera] = Some(instant(&scene.frame(view).unwrap()));
@@ -88,18 +88,18 @@ fn instants(scene: &Scene) -> BTreeMap<usize, Vec<Option<usize>>> {
 }
 
 /// A folder for an N3DV scene of `cameras` cameras, and options with a cache of its own.
-fn rig(cameras: usize, size: (u32, u32)) -> (tempfile::TempDir, SceneOptions) {
+pub(super) fn rig(cameras: usize, size: (u32, u32)) -> (tempfile::TempDir, SceneOptions) {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[cameras, 17], &llff_rows(&ring(cameras, size.0, size.1)))).unwrap();
     let options = SceneOptions { video_cache: Some(dir.path().join("cache")), ..Default::default() };
     (dir, options)
 }
 
-fn video(dir: &tempfile::TempDir, camera: usize) -> PathBuf {
+pub(super) fn video(dir: &tempfile::TempDir, camera: usize) -> PathBuf {
     dir.path().join(format!("cam{camera:02}.mp4"))
 }
 
-fn opened(dir: &tempfile::TempDir, options: &SceneOptions) -> Scene {
+pub(super) fn opened(dir: &tempfile::TempDir, options: &SceneOptions) -> Scene {
     open(dir.path(), options, &Limits::default()).unwrap()
 }
 

@@ -1,9 +1,10 @@
 //! Single frames of videos. A video is decoded once, on the first use of one of its frames, into a cache folder.
 
 use super::super::frames::Plan;
-use super::probe::turn_of;
+use super::decoded::{Decoded, PRINT_TIMES};
+use super::probe::{MOST_PRINTED, count_images, probe, turn_of};
 use super::{CONSECUTIVE, STREAM, cache_folder, cache_name, input, run};
-use cc4dgs_core::{Error, ImageSource, RawView, Result, SceneOptions};
+use cc4dgs_core::{Error, ImageSource, Limits, RawView, Result, SceneOptions};
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -59,6 +60,13 @@ impl Wanted {
             Self::Ranges(ranges) => ranges.iter().map(|r| r[1] - r[0] + 1).sum(),
         }
     }
+    /// The highest of the frame numbers.
+    fn last(&self) -> usize {
+        match self {
+            Self::Progression { first, stride, count } => first + stride * count.saturating_sub(1),
+            Self::Ranges(ranges) => ranges.last().map_or(0, |range| range[1]),
+        }
+    }
     /// How many wanted frames come before `frame`, if it is one of them.
     fn rank(&self, frame: usize) -> Option<usize> {
         match self {
@@ -97,11 +105,12 @@ impl Wanted {
 pub(crate) struct VideoFrames {
     clips: BTreeMap<PathBuf, Clip>,
     options: SceneOptions,
+    limits: Limits,
 }
 
 impl VideoFrames {
     /// Collects which frames of which videos the views want.
-    pub(crate) fn new(views: &[RawView], plans: &[Plan], options: &SceneOptions) -> Result<Self> {
+    pub(crate) fn new(views: &[RawView], plans: &[Plan], options: &SceneOptions, limits: &Limits) -> Result<Self> {
         let mut wanted: BTreeMap<PathBuf, (Vec<usize>, usize)> = BTreeMap::new();
         for view in views {
             if let ImageSource::Video { path, frame } = &view.image {
@@ -114,13 +123,15 @@ impl VideoFrames {
             frames.dedup();
             clips.insert(path, Clip { wanted: Wanted::new(&frames), size: plan_size(&plans[camera]), busy: Mutex::new(()) });
         }
-        Ok(Self { clips, options: options.clone() })
+        Ok(Self { clips, options: options.clone(), limits: *limits })
     }
     /// The size extracted frames have.
     pub(crate) fn size(&self, plan: &Plan) -> [u32; 2] {
         plan_size(plan)
     }
     /// The file of frame `frame` of `video`; decodes the video if that has not happened.
+    ///
+    /// Errors: [`Error::Data`] for a video of which frames up to the last wanted one do not decode, [`Error::Io`] for a cache that cannot be written.
     pub(crate) fn extract(&self, video: &Path, frame: usize) -> Result<PathBuf> {
         let bug = || Error::parameter(format!("video {}", video.display()), format!("frame {frame} was not asked for"), "Reopen the scene");
         let clip = self.clips.get(video).ok_or_else(bug)?;
@@ -129,17 +140,13 @@ impl VideoFrames {
         let folder = cache_folder(&self.options)?.join(cache_name(video, &what)?);
         // A poisoned lock only means that another extraction failed; this one may do better.
         let _guard = clip.busy.lock().unwrap_or_else(|e| e.into_inner());
-        if !folder.is_dir() {
-            self.decode(video, clip, &folder)?;
-        }
         let file = folder.join(format!("{:06}.png", rank + 1));
-        // Whoever cleans a cache may leave a part of it.
-        if !file.is_file() && decoded_count(&folder).is_none_or(|count| rank < count) {
-            std::fs::remove_dir_all(&folder).map_err(|e| Error::io(&folder, e))?;
+        // Whoever cleans a cache may leave a part of it. Where images are fewer than frames, it is not known whose they are.
+        if !file.is_file() || decoded_count(&folder) != Some(clip.wanted.count()) {
+            if folder.is_dir() {
+                std::fs::remove_dir_all(&folder).map_err(|e| Error::io(&folder, e))?;
+            }
             self.decode(video, clip, &folder)?;
-        }
-        if !file.is_file() {
-            return Err(Error::data(format!("video {}", video.display()), format!("it has no frame {frame}"), "Shorten scene.frames"));
         }
         Ok(file)
     }
@@ -148,22 +155,33 @@ impl VideoFrames {
         let cache = cache_folder(&self.options)?;
         std::fs::create_dir_all(&cache).map_err(|e| Error::io(&cache, e))?;
         let work = tempfile::tempdir_in(&cache).map_err(|e| Error::io(&cache, e))?;
+        let facts = probe(video, &self.options, &self.limits)?;
         // The display matrix is applied here, because versions of ffmpeg differ in what they do with it.
         let turn = turn_of(video, &self.options)?.filter;
         let turn = if turn.is_empty() { String::new() } else { format!("{turn},") };
-        let filter = format!("select='{}',{turn}{CONSECUTIVE},scale={}:{}:flags=lanczos,format=rgb24", clip.wanted.condition(), clip.size[0], clip.size[1]);
+        let (condition, [width, height]) = (clip.wanted.condition(), clip.size);
+        let filter = format!("{PRINT_TIMES},select='{condition}',{turn}{CONSECUTIVE},scale={width}:{height}:flags=lanczos,format=rgb24");
         // In a pattern, a percent sign of the folder's name is written twice.
         let outputs = work.path().to_str().map_or_else(|| work.path().to_path_buf(), |folder| PathBuf::from(folder.replace('%', "%%")));
         let (video_input, count, pattern) = (input(video), clip.wanted.count().to_string(), outputs.join("%06d.png"));
-        let before = ["-nostdin", "-v", "error", "-noautorotate", "-protocol_whitelist", "file", "-i"];
+        // The times of the packets as they are: by default ffmpeg subtracts that at which the file starts.
+        let before = ["-nostdin", "-v", "error", "-copyts", "-noautorotate", "-protocol_whitelist", "file", "-i"];
         let map = format!("0:{STREAM}");
         let after = ["-map", &map, "-vf", &filter, "-r", "25", "-frames:v", &count];
         let mut arguments = before.map(OsStr::new).to_vec();
         arguments.push(&video_input);
         arguments.extend(after.map(OsStr::new));
         arguments.push(pattern.as_os_str());
-        run(&self.options.ffmpeg, &arguments, video, 1 << 20, Some(&cache))?;
+        let printed = run(&self.options.ffmpeg, &arguments, video, MOST_PRINTED, Some(&cache))?;
         let decoded = std::fs::read_dir(work.path()).map_err(|e| Error::io(work.path(), e))?.count();
+        let frames = Decoded::read(&printed);
+        // Where images are missing, the video was decoded to its end.
+        let total = || if decoded < clip.wanted.count() { Ok(Some(frames.times.len())) } else { count_images(video, &self.options) };
+        frames.check(video, &facts, clip.wanted.last(), total)?;
+        if decoded != clip.wanted.count() {
+            let problem = format!("{decoded} of {count} wanted frames were decoded");
+            return Err(Error::data(format!("video {}", video.display()), problem, "Check the video, or shorten scene.frames"));
+        }
         let counted = work.path().join(COUNT);
         std::fs::write(&counted, decoded.to_string()).map_err(|e| Error::io(&counted, e))?;
         let kept = work.keep();
@@ -199,7 +217,7 @@ mod tests {
             let wanted = Wanted::new(&frames);
             let ranks: Vec<usize> = frames.iter().map(|f| wanted.rank(*f).unwrap()).collect();
             assert!(ranks.is_sorted_by(|a, b| a < b) && *ranks.last().unwrap() == wanted.count() - 1, "{wanted:?}");
-            assert!(wanted.rank(frames[frames.len() - 1] + 1).is_none());
+            assert!(wanted.rank(frames[frames.len() - 1] + 1).is_none() && wanted.last() == frames[frames.len() - 1], "{wanted:?}");
         }
         assert_eq!(Wanted::new(&[3, 5, 7]).condition(), "between(n,3,7)*not(mod(n-3,2))");
         let gaps = Wanted::new(&[0, 1, 2, 6, 7, 20]);

@@ -1,6 +1,7 @@
 //! Videos through the `ffmpeg` and `ffprobe` commands: what they contain ([`probe`]), their frames on a common clock ([`footage`]), extraction of
-//! single frames ([`VideoFrames`]), and the motion in them over time ([`motion`]).
+//! single frames ([`VideoFrames`]), which frames decode ([`decoded`]), and the motion in them over time ([`motion`]).
 
+mod decoded;
 mod extract;
 mod motion;
 mod probe;
@@ -95,10 +96,10 @@ fn of_high_range(names: &[String], facts: &[VideoFacts]) -> Option<String> {
     ))
 }
 
-/// A path as an input of ffmpeg: never an address or an option, whatever its name.
-fn input(video: &Path) -> OsString {
+/// A path as an input or output of ffmpeg: never an address or an option, whatever its name.
+fn input(path: &Path) -> OsString {
     let mut text = OsString::from("file:");
-    text.push(video);
+    text.push(path);
     text
 }
 

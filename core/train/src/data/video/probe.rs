@@ -9,15 +9,15 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
-/// The most that is read of the list of packets: days of video.
-const MOST_PRINTED: u64 = 1 << 28;
+/// The most that is read of the list of packets or frames: days of video.
+pub(super) const MOST_PRINTED: u64 = 1 << 28;
 /// Tangent of one degree. ffmpeg takes angles that near to a multiple of 90 degrees as that multiple, and so do we.
 const TAN_ONE_DEGREE: f64 = 0.017_455;
 /// The rate of a video that states none. It cancels out where all videos of a scene state none.
 const DEFAULT_RATE: f64 = 25.0;
 
 /// Difference of times in seconds that is rounding.
-const SAME_TIME: f64 = 1e-4;
+pub(super) const SAME_TIME: f64 = 1e-4;
 
 /// What `ffprobe` says about a video.
 #[derive(Clone)]
@@ -28,6 +28,8 @@ pub(crate) struct VideoFacts {
     pub times: Vec<f64>,
     /// Whether each frame is a key frame.
     pub keys: Vec<bool>,
+    /// Whether the file states the times of all frames. Else `times` are those of a constant rate, from 0 on.
+    pub is_timed: bool,
     /// Whether each frame holds two fields of different moments, every second row of one.
     pub interlaced: bool,
     /// Whether its colours are those of high dynamic range: PQ or HLG.
@@ -68,6 +70,8 @@ struct Packet {
 
 #[derive(Deserialize)]
 struct Stream {
+    codec_name: Option<String>,
+    nb_read_frames: Option<String>,
     #[serde(default)]
     width: u64,
     #[serde(default)]
@@ -107,7 +111,7 @@ pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Re
 }
 
 fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFacts> {
-    let stream = "stream=width,height,r_frame_rate,avg_frame_rate,field_order,color_transfer:stream_side_data=displaymatrix,rotation";
+    let stream = "stream=codec_name,width,height,r_frame_rate,avg_frame_rate,field_order,color_transfer:stream_side_data=displaymatrix,rotation";
     let printed = ask(video, options, &["-show_entries", &format!("packet=pts_time,dts_time,flags:{stream}")])?;
     let bad = |problem: String, remedy: &str| Error::data(format!("video {}", video.display()), problem, remedy);
     let Some(stream) = printed.streams.first() else { return Err(bad("it holds no video".into(), "Check the file")) };
@@ -119,11 +123,12 @@ fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFa
     let size = [stream.width as u32, stream.height as u32];
     let first = if has_leading(&printed.packets) { first_decoded(video, options)? } else { None };
     let (times, keys) = frame_times(&printed.packets, stream, first);
+    let is_timed = shown_from(&printed.packets, first).all(|packet| seconds(&packet.pts_time).is_some());
     if times.is_empty() {
         return Err(bad("it has no frame".into(), "Check the video"));
     }
     let size = if turn.swaps { [size[1], size[0]] } else { size };
-    Ok(VideoFacts { size, times, keys, interlaced: stream.is_interlaced(), high_range: stream.is_high_range() })
+    Ok(VideoFacts { size, times, keys, is_timed, interlaced: stream.is_interlaced(), high_range: stream.is_high_range() })
 }
 
 /// How the frames of a video are turned, without listing its packets.
@@ -139,6 +144,12 @@ pub(super) fn turn_of(video: &Path, options: &SceneOptions) -> Result<Turn> {
 fn first_decoded(video: &Path, options: &SceneOptions) -> Result<Option<f64>> {
     let printed = ask(video, options, &["-read_intervals", "%+#1", "-show_entries", "frame=pts_time"])?;
     Ok(printed.frames.first().and_then(|frame| seconds(&frame.pts_time)))
+}
+
+/// How many images a video gives, decoded to its end; `None` where `ffprobe` does not say.
+pub(super) fn count_images(video: &Path, options: &SceneOptions) -> Result<Option<usize>> {
+    let printed = ask(video, options, &["-count_frames", "-show_entries", "stream=nb_read_frames"])?;
+    Ok(printed.streams.first().and_then(|stream| stream.nb_read_frames.as_deref()?.parse().ok()))
 }
 
 /// Runs `ffprobe` on `video`; `what` says what it shows.
@@ -212,6 +223,10 @@ impl Stream {
     fn is_interlaced(&self) -> bool {
         matches!(self.field_order.as_deref(), Some("tt" | "bb" | "tb" | "bt"))
     }
+    /// Whether some packets give no image of their own: the alternative reference frames of VP8. Each has the time of the next packet.
+    fn has_hidden(&self) -> bool {
+        self.codec_name.as_deref() == Some("vp8")
+    }
     /// Whether its values follow one of the two curves of high dynamic range.
     fn is_high_range(&self) -> bool {
         matches!(self.color_transfer.as_deref(), Some("smpte2084" | "arib-std-b67"))
@@ -252,15 +267,27 @@ fn has_leading(packets: &[Packet]) -> bool {
     !is_partly_timed && shown(packets).any(|packet| is_leading(&packet))
 }
 
+/// Packets that are shown, from the time `first` on where one is given.
+fn shown_from(packets: &[Packet], first: Option<f64>) -> impl Iterator<Item = &Packet> {
+    shown(packets).filter(move |packet| first.is_none_or(|first| seconds(&packet.pts_time).is_some_and(|time| time >= first - SAME_TIME)))
+}
+
 /// Times and key frames in the order of presentation, from the time `first` on where one is given. Packets that are only decoded, not shown, are left out.
 fn frame_times(packets: &[Packet], stream: &Stream, first: Option<f64>) -> (Vec<f64>, Vec<bool>) {
-    let is_late = |packet: &&Packet| first.is_none_or(|first| seconds(&packet.pts_time).is_some_and(|time| time >= first - SAME_TIME));
-    let shown: Vec<&Packet> = shown(packets).filter(is_late).collect();
+    let shown: Vec<&Packet> = shown_from(packets, first).collect();
     let stated: Option<Vec<f64>> = shown.iter().map(|packet| seconds(&packet.pts_time)).collect();
+    let has_hidden = stated.is_some() && stream.has_hidden();
     // Without times of all frames, their order is that of the packets, at a constant rate.
     let times = stated.unwrap_or_else(|| (0..shown.len()).map(|i| i as f64 / stream.rate()).collect());
     let mut frames: Vec<(f64, bool)> = times.into_iter().zip(shown.iter().map(|p| p.flags.contains('K'))).collect();
     frames.sort_by(|a, b| a.0.total_cmp(&b.0));
+    if has_hidden {
+        frames.dedup_by(|later, kept| {
+            let is_same = later.0 - kept.0 <= SAME_TIME;
+            kept.1 |= is_same && later.1;
+            is_same
+        });
+    }
     frames.into_iter().unzip()
 }
 
@@ -333,6 +360,10 @@ mod tests {
             assert_eq!(times, vec![0.0, 0.1]);
         }
         assert_eq!(read("[{},{}]", r#"{"avg_frame_rate":"1/0"}"#).0, vec![0.0, 1.0 / DEFAULT_RATE]);
+        // Of two packets of VP8 at one time, the first is not shown.
+        let twice = r#"[{"pts_time":"0.0","flags":"K_"},{"pts_time":"0.04"},{"pts_time":"0.04"},{"pts_time":"0.08"}]"#;
+        assert_eq!(read(twice, r#"{"codec_name":"vp8"}"#), (vec![0.0, 0.04, 0.08], vec![true, false, false]));
+        assert_eq!(read(twice, r#"{"codec_name":"h264"}"#).0, [0.0, 0.04, 0.04, 0.08]);
         // Cut without decoding: what comes before the first key frame needs frames that are gone.
         let cut: Vec<Packet> = serde_json::from_str(r#"[{"pts_time":"0.2","flags":"K_"},{"pts_time":"0.1"},{},{"pts_time":"0.3"}]"#).unwrap();
         assert!(has_leading(&cut) && !has_leading(&cut[..1]));
