@@ -22,7 +22,8 @@ pub fn network(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<Vec<f32>> {
         let input = layer.parent.map_or(x, |parent| &results[parent]);
         let mut y = linear(input, &weights[layer.weight], &weights[layer.bias]);
         if layer.relu {
-            y.iter_mut().for_each(|v| *v = v.max(0.0));
+            // `max` would turn NaN into 0, and hide it.
+            y.iter_mut().for_each(|v| *v = if *v <= 0.0 { 0.0 } else { *v });
         }
         match layer.slot {
             Some(slot) => {
@@ -92,5 +93,7 @@ mod tests {
         let weights = [1.0, -1.0, 0.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0, -1.0, 3.0, 1.0];
         assert_eq!(weights.len(), shape.parameter_count());
         assert_eq!(network(&shape, &weights, &[4.0, -3.0]), [[4.0, 6.0], [10.0, 1.0]]);
+        let of_nan = network(&shape, &weights, &[f32::NAN, -3.0]);
+        assert!(of_nan.iter().all(|head| head[0].is_nan() && !head[1].is_nan()), "{of_nan:?}");
     }
 }

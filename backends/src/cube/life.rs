@@ -1,6 +1,6 @@
 //! Lives on the device: a thread per Gaussian, for all times.
 
-use super::tensor::{THREADS, constant, floats, workgroups_for};
+use super::tensor::{THREADS, constant, floats, is_number, workgroups_for};
 use crate::ops::life::{HIDDEN, LASTING, LEAST_FALLOFF, LifeBackward, LifeOps, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -30,12 +30,13 @@ fn faded(in_falloffs: f32) -> f32 {
     select(squared < -HIDDEN, squared, -HIDDEN)
 }
 
-/// The opacity factor, from e^[`HIDDEN`] to 1.
+/// The opacity factor, from e^[`HIDDEN`] to 1; NaN stays.
 #[cube]
 fn bounded(factor: f32) -> f32 {
     let least = 9.357_623e-14f32;
-    let factor = select(factor > least, factor, least);
-    select(factor < 1.0, factor, 1.0f32)
+    let above = select(factor > least, factor, least);
+    let between = select(above < 1.0, above, 1.0f32);
+    select(is_number(factor), between, factor)
 }
 
 /// What a Gaussian's life is at all times.
@@ -60,11 +61,13 @@ impl Life {
     fn of(attributes: &[f32], at: usize, #[comptime] gated: bool) -> Life {
         let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
         let smaller = smaller_share(logit);
-        let rest = select(logit < 0.0, 1.0 - smaller, smaller);
+        // A gate that is NaN stays NaN: the exponential of NaN is any number on some devices.
+        let known = is_number(logit);
+        let rest = select(known, select(logit < 0.0, 1.0 - smaller, smaller), logit);
         let temporary = select(rest <= LASTING, 0.0f32, rest);
         let wanted = width(attributes[at + 2]);
         Life {
-            gate: select(logit < 0.0, smaller, 1.0 - smaller),
+            gate: select(known, select(logit < 0.0, smaller, 1.0 - smaller), logit),
             rest,
             temporary,
             half_width: width(attributes[at + 1]),
@@ -94,7 +97,8 @@ fn forward(attributes: &[f32], times: &[f32], out: &mut [f32], rows: u32, hidden
             for axis in 0..3usize {
                 out[base + 3 * row + axis] = attributes[at + 4 + axis] * since * life.moving;
             }
-            out[base + 3 * rows as usize + row] = select(factor < hidden_below, HIDDEN, factor.ln());
+            let log = select(factor < hidden_below, HIDDEN, factor.ln());
+            out[base + 3 * rows as usize + row] = select(is_number(factor), log, factor);
         }
     }
 }

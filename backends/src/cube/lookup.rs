@@ -129,15 +129,35 @@ fn rows_of_slots(points: &[f32], levels: &[u32], rows: &mut [u32], slots: &mut [
     }
 }
 
+/// starts`[row]`: the first of the sorted slots that are of this row or a later one. This is one search per row; in [`gather`] every slice of every number
+/// would need one.
+#[cube(launch)]
+fn first_slots(sorted: &[u32], starts: &mut [u32]) {
+    if ABSOLUTE_POS < starts.len() {
+        let row = ABSOLUTE_POS as u32;
+        let mut low = 0usize.runtime();
+        let mut high = sorted.len();
+        while low < high {
+            let middle = (low + high) / 2;
+            if sorted[middle] < row {
+                low = middle + 1;
+            } else {
+                high = middle;
+            }
+        }
+        starts[ABSOLUTE_POS] = low as u32;
+    }
+}
+
 /// Slices of the slots of a row: rows of coarse levels have thousands.
 const SLICES: usize = 16;
 /// Numbers of the table that a workgroup computes.
 const NUMBERS: usize = THREADS as usize / SLICES;
 
-/// Gradient of the table: each row finds its slots among the sorted ones and visits them in order, in slices that are added up in order.
+/// Gradient of the table: each row visits its slots in order, from its entry of `starts` to that of the next row, in slices that are added up in order.
 #[cube(launch)]
 fn gather(
-    sorted: &[u32],
+    starts: &[u32],
     slots: &[u32],
     points: &[f32],
     levels: &[u32],
@@ -153,31 +173,19 @@ fn gather(
     let mut sum = 0.0f32;
     if item < out.len() {
         let (f, count) = (features as usize, level_count as usize);
-        let (row, feature) = ((item / f) as u32, item % f);
-        let mut low = 0usize.runtime();
-        let mut high = sorted.len();
-        while low < high {
-            let middle = (low + high) / 2;
-            if sorted[middle] < row {
-                low = middle + 1;
-            } else {
-                high = middle;
-            }
-        }
+        let (row, feature) = (item / f, item % f);
         let corners = comptime!(1usize << rules.dims);
-        low += slice;
-        let mut more = low < sorted.len();
-        while more {
-            if sorted[low] == row {
-                let slot = slots[low] as usize;
-                let cell = slot / corners;
-                let (_, weight) = corner(points, levels, cell / count, cell % count, (slot % corners) as u32, rules);
-                sum += weight * grad[cell * f + feature];
-                low += SLICES;
-                more = low < sorted.len();
-            } else {
-                more = false;
-            }
+        let mut index = starts[row] as usize + slice;
+        let mut end = slots.len();
+        if row + 1 < starts.len() {
+            end = starts[row + 1] as usize;
+        }
+        while index < end {
+            let slot = slots[index] as usize;
+            let cell = slot / corners;
+            let (_, weight) = corner(points, levels, cell / count, cell % count, (slot % corners) as u32, rules);
+            sum += weight * grad[cell * f + feature];
+            index += SLICES;
         }
     }
     sums[thread] = sum;
@@ -235,12 +243,14 @@ impl LookupBackward for CubeBackend {
             Rules::of(&shape),
         );
         let (sorted, slots) = sort_pairs(rows, slots, count, usize::BITS - shape.rows().leading_zeros());
+        let starts = empty(&points, [shape.rows()], DType::U32);
+        first_slots::launch(&client, workgroups_for(shape.rows()), dim, sorted.into_buffer_arg(), starts.clone().into_buffer_arg());
         let out = floats(&grad, [shape.parameter_count()]);
         gather::launch(
             &client,
             spread(shape.parameter_count().div_ceil(NUMBERS)),
             dim,
-            sorted.into_buffer_arg(),
+            starts.into_buffer_arg(),
             slots.into_buffer_arg(),
             points.into_buffer_arg(),
             levels.into_buffer_arg(),

@@ -122,9 +122,13 @@ pub fn binding_bytes(client: &Client) -> u64 {
     indexed(buffer_bytes(client)).min(BINDING_CAP.load(Ordering::Relaxed))
 }
 
-/// `bytes`, or less where that is more words of four bytes than the 32 bits of an index count. CUDA and Vulkan allocate arrays of tens of gigabytes.
+/// Upper bound on the words of an array. An index has 32 bits, and [`spread`] launches fewer than 2^17 threads more than there are items: their indices must
+/// not wrap, or they would be those of the first items.
+const MOST_WORDS: u64 = (1 << 32) - (1 << 17);
+
+/// `bytes`, or less where that is more than [`MOST_WORDS`] words of four bytes. CUDA and Vulkan allocate arrays of tens of gigabytes.
 fn indexed(bytes: u64) -> u64 {
-    bytes.min(4 * u64::from(u32::MAX))
+    bytes.min(4 * MOST_WORDS)
 }
 
 /// 0..`rows` in parts of rows of `width` floats that fit one binding. Parts start at multiples of 256 bytes, as bindings must.
@@ -200,6 +204,12 @@ pub fn is_finite(value: f32) -> bool {
     (u32::reinterpret(value) & 0x7f80_0000u32) != 0x7f80_0000u32
 }
 
+/// Whether `value` is finite or infinite and not NaN, by its bits as in [`is_finite`].
+#[cube]
+pub fn is_number(value: f32) -> bool {
+    (u32::reinterpret(value) & 0x7fff_ffffu32) <= 0x7f80_0000u32
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -208,6 +218,13 @@ mod tests {
     fn words_of_a_binding_can_be_counted_in_32_bits() {
         assert_eq!(indexed(128 << 20), 128 << 20);
         // A quarter of the memory of an H200, which CUDA allocates at once.
-        assert_eq!(indexed(35 << 30) / 4, u64::from(u32::MAX));
+        let words = (indexed(35 << 30) / 4) as usize;
+        // From one item per thread to one per sixteen threads.
+        for per_workgroup in [THREADS as usize, 64, 16] {
+            let CubeCount::Static(x, y, z) = spread(words.div_ceil(per_workgroup)) else { panic!("the number of workgroups is known") };
+            assert!(x <= 65_535 && y <= 65_535, "{x} x {y} workgroups");
+            let items = u64::from(x) * u64::from(y) * u64::from(z) * per_workgroup as u64;
+            assert!(items >= words as u64 && items <= 1 << 32, "{items} indices for {words} words");
+        }
     }
 }

@@ -3,7 +3,7 @@
 //! The number of distinct vertices is known to the device alone, but buffers need a size. So the search has two halves. Between them, one read-back gets the
 //! numbers of all levels; or the worst case is allocated, and nothing is read back.
 
-use super::limits::{check_binding, unread};
+use super::limits::{check_binding, check_sorted, unread};
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::index::{self, MAX_RESOLUTION};
 use burn::backend::tensor::{FloatTensor, IntTensor};
@@ -124,6 +124,7 @@ impl VoxelCorners {
         }
         let points = points.inner();
         check_binding(&points.device(), "voxel corners", "points", m, size_of::<[u32; 8]>())?;
+        check_sorted(&points.device(), "voxel corners", "points", m, 8)?;
         let begun: Vec<CornersBegun<Dispatch>> =
             grids.iter().map(|&grid| <Dispatch as CornerOps>::begin_corners(points.clone().into_dispatch(), grid, reuse)).collect();
         let vertices = |grid: &GridBox| if reuse { (grid.resolution as usize + 1).saturating_pow(3).min(8 * m) } else { 8 * m };

@@ -26,6 +26,36 @@ pub(super) fn check_binding(_: &Device, _: &str, _: &str, _: usize, _: usize) ->
     Ok(())
 }
 
+/// Upper bound on the items that a GPU sorts: prefix sums saturate there.
+#[cfg(feature = "cube")]
+const MOST_SORTED: u64 = i32::MAX as u64;
+
+/// Upper bound on the rows of `items` sorted items each.
+#[cfg(feature = "cube")]
+fn most_sorted_rows(items: usize) -> u64 {
+    MOST_SORTED / items.max(1) as u64
+}
+
+/// An error if `rows` rows of `items` items each are more items than `device` sorts at once; `unit` says what a row is, in the plural. Processors have no such
+/// limit.
+#[cfg(feature = "cube")]
+pub(super) fn check_sorted(device: &Device, object: &str, unit: &str, rows: usize, items: usize) -> Result<()> {
+    let device = device.clone().without_autodiff();
+    let burn::backend::DispatchDevice::Cube(_) = device.as_dispatch() else { return Ok(()) };
+    let limit = most_sorted_rows(items);
+    if rows as u64 <= limit {
+        return Ok(());
+    }
+    let remedy = format!("The value counts {unit}; a GPU sorts {items} items for each of them, and at most {MOST_SORTED} at once. Give fewer {unit}");
+    Err(Error::limit(object, rows as u64, limit, remedy))
+}
+
+/// An error if there are more items than the device sorts at once. Processors have no such limit.
+#[cfg(not(feature = "cube"))]
+pub(super) fn check_sorted(_: &Device, _: &str, _: &str, _: usize, _: usize) -> Result<()> {
+    Ok(())
+}
+
 /// The error for `object`, which the device did not give back.
 pub(super) fn unread(object: &str, error: impl Display) -> Error {
     let text = error.to_string();
@@ -44,6 +74,15 @@ mod tests {
         let error = unread("the number of pairs", "An error happened\nCaused by:\n  device lost\nBacktrace:\n   0: main").to_string();
         assert!(error.contains("the number of pairs") && error.contains("device lost") && error.contains("--device flex"), "{error}");
         assert!(!error.contains("main"), "{error}");
+    }
+
+    #[cfg(feature = "cube")]
+    #[test]
+    fn sorted_items_and_sums_over_them_stay_below_where_prefix_sums_saturate() {
+        for items in [0, 1, 8, 128, 1000] {
+            let rows = most_sorted_rows(items);
+            assert!(rows * items as u64 <= MOST_SORTED && (rows + 1) * items.max(1) as u64 > MOST_SORTED, "{rows} rows of {items} items");
+        }
     }
 
     /// WebGPU guarantees 8 storage buffers per kernel, of which CubeCL takes one for scalars and lengths.

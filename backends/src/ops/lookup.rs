@@ -1,6 +1,6 @@
 //! Interpolated lookup in multi-resolution grids of stored features: hash grids and planes. The gradient goes to the table alone.
 
-use super::limits::check_binding;
+use super::limits::{check_binding, check_sorted};
 use crate::cpu::lookup as kernel;
 use crate::cpu::tensor::CpuBackend;
 use crate::ops::autodiff::{differentiate, record};
@@ -67,15 +67,19 @@ pub fn lookup(table: Tensor<1>, points: Tensor<2>, shape: &Arc<GridShape>) -> Re
     if dims != shape.dims || m == 0 || !(1..=MAX_DIMS).contains(&dims) {
         return bad(format!("points have shape [{m},{dims}], the grid has {} axes", shape.dims), "Give at least one point with a coordinate per axis");
     }
+    if shape.width() == 0 {
+        return bad(format!("the grid has {} levels of {} features", shape.levels.len(), shape.features), "Give at least one level and one feature");
+    }
     if table.dims()[0] != shape.parameter_count() {
         return bad(format!("{} weights, the grid needs {}", table.dims()[0], shape.parameter_count()), "Load weights of the same configuration");
     }
     if shape.levels.iter().any(|l| l.rows == 0 || l.size[..dims].iter().any(|&s| s < if shape.clamps { 2 } else { 1 })) {
         return bad("a level has no cell".into(), "Give every axis at least two vertices");
     }
-    // Backwards, every corner of every point has a word.
+    // Backwards, every corner of every point has a word, and they are sorted.
     let slots = if table.device().is_autodiff() { shape.levels.len() << dims } else { 0 };
     check_binding(&points.device(), "grid lookup", "points", m, slots.max(shape.width()) * size_of::<u32>())?;
+    check_sorted(&points.device(), "grid lookup", "points", m, slots)?;
     check_binding(&points.device(), "grid lookup", "weights", shape.parameter_count(), size_of::<f32>())?;
     Ok(Tensor::from_dispatch(<Dispatch as LookupOps>::lookup(table.into_dispatch(), points.into_dispatch(), shape.clone())))
 }

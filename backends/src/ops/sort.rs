@@ -1,5 +1,6 @@
 //! Stable sorting of unsigned keys, as tile lists and shared vertices need it.
 
+use super::limits::check_sorted;
 use crate::cpu::sort::stable_order;
 use crate::cpu::tensor::CpuBackend;
 use burn::backend::tensor::IntTensor;
@@ -29,5 +30,6 @@ pub fn sort_order(keys: Tensor<1, Int>, bits: u32) -> Result<Tensor<1, Int>> {
     if !(1..=32).contains(&bits) {
         return Err(Error::parameter("sort", format!("{bits} bits"), "Choose 1 to 32"));
     }
+    check_sorted(&keys.device(), "sort", "keys", keys.dims()[0], 1)?;
     Ok(Tensor::from_dispatch(<Dispatch as SortOps>::order(keys.into_dispatch(), bits)))
 }

@@ -145,3 +145,51 @@ fn arrays_of_networks_beyond_a_binding_are_errors() {
         }
     }
 }
+
+/// A NaN in the input must reach the outputs of its row through every ReLU, and all gradients of weights: a training that hides it goes on with weights that
+/// are no numbers. Other rows are what they are without it.
+#[test]
+fn a_nan_comes_through_every_network() {
+    let _held = crate::alone();
+    let shape = Arc::new(ReluShape { input: 6, trunk: vec![20, 16], heads: vec![vec![12, 3], vec![5]] });
+    const ROWS: usize = 40;
+    const BROKEN: usize = 17;
+    let widths = shape.output_widths();
+    // Outputs, then gradients of weights and input.
+    let run = |value: Option<f32>, device: &Device| {
+        poison(device);
+        let device = device.clone().autodiff();
+        let mut given = numbers(ROWS * shape.input, 0.37);
+        if let Some(value) = value {
+            given[BROKEN * shape.input + 2] = value;
+        }
+        let x = tensor(given, [ROWS, shape.input], &device).require_grad();
+        let count = shape.parameter_count();
+        let weights = tensor(numbers(count, 0.91), [count], &device).require_grad();
+        let outputs = mlp_relu(x.clone(), weights.clone(), &shape).expect("outputs");
+        let mut grads = outputs.iter().map(|o| o.clone().sum()).reduce(|a, b| a + b).expect("an output").backward();
+        let gradients = [values(&weights.grad_remove(&mut grads).expect("of the weights")), values(&x.grad_remove(&mut grads).expect("of the input"))];
+        (outputs.iter().map(values).collect::<Vec<_>>(), gradients)
+    };
+    let mut first: Option<Vec<f32>> = None;
+    // With less shared memory, networks run layer by layer.
+    for shared_bytes in [u64::MAX, 2 << 10] {
+        for (name, device) in devices() {
+            cap_shared_memory(shared_bytes);
+            let (whole, broken) = (run(None, &device), run(Some(f32::NAN), &device));
+            cap_shared_memory(u64::MAX);
+            for ((whole, broken), &width) in whole.0.iter().zip(&broken.0).zip(&widths) {
+                for (row, (whole, broken)) in whole.chunks(width).zip(broken.chunks(width)).enumerate() {
+                    let right = if row == BROKEN { broken.iter().all(|v| v.is_nan()) } else { broken == whole };
+                    assert!(right, "{name}: row {row} is {broken:?}, and {whole:?} without the NaN");
+                }
+            }
+            let [of_weights, of_input] = broken.1;
+            assert!(of_weights.iter().any(|g| g.is_nan()) && whole.1[0].iter().all(|g| g.is_finite()), "{name}: gradient of the weights");
+            // The gradient of an input is a product of weights where every ReLU passes it.
+            let own = of_input[BROKEN * shape.input..][..shape.input].to_vec();
+            let d = distance(&own, first.get_or_insert_with(|| own.clone()));
+            assert!(d < 2e-5 && own.iter().all(|g| *g != 0.0), "{name}: gradient of the input {own:?} differs by {d:.2e}");
+        }
+    }
+}

@@ -207,6 +207,25 @@ fn what_lasts_has_a_gradient_of_its_gate_alone() {
     }
 }
 
+/// A gate that is NaN must not look like a hidden Gaussian: the watchdog of a training looks at offsets.
+#[test]
+fn a_gate_that_is_nan_stays_nan() {
+    let row = |gate: f32| [0.5, 0.1f32.ln(), 0.2f32.ln(), gate, 0.3, -0.2, 0.1];
+    let attributes = [row(0.1), row(f32::NAN), row(0.2)].concat();
+    for (name, device) in devices() {
+        for (gated_velocity, hidden_below) in [(false, 0.01), (true, 0.01), (true, 0.0)] {
+            poison(&device);
+            let rules = LifeRules { times_norm: vec![0.5, 0.9], hidden_below, gated_velocity };
+            let input = Tensor::<2>::from_data(TensorData::new(attributes.clone(), [3, WIDTH]), &device);
+            for at in lives(input, rules).unwrap() {
+                let (factors, shifts) = (to_vec(at.log_factor, "factors").unwrap(), to_vec(at.shift, "shifts").unwrap());
+                assert!(factors[1].is_nan() && factors[0].is_finite() && factors[2].is_finite(), "{name}: {factors:?}");
+                assert!(shifts[3..6].iter().all(|shift| shift.is_nan() == gated_velocity), "{name}: {shifts:?}");
+            }
+        }
+    }
+}
+
 #[test]
 fn lives_of_another_shape_are_refused() {
     let device = Device::flex();

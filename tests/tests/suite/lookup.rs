@@ -130,3 +130,54 @@ fn what_is_no_number_gets_a_defined_answer() {
         }
     }
 }
+
+/// Rows that no corner meets, one corner, as many as a kernel adds side by side, one more, and many: on the first and the last row of every level.
+#[test]
+fn gradients_of_rows_with_any_number_of_corners_are_exact() {
+    /// Points at each eighth.
+    const COUNTS: [[usize; 9]; 4] = [[1, 0, 0, 15, 1, 40, 0, 0, 17], [0, 0, 0, 0, 0, 0, 0, 0, 1], [0, 16, 0, 0, 0, 0, 33, 0, 0], [300, 0, 0, 0, 0, 0, 0, 0, 0]];
+    let mut shape = GridShape { dims: 1, features: 3, levels: Vec::new(), stagger: 0.0, smooth: false, clamps: true, outside: Outside::Clamp };
+    // Points at eighths are vertices of the first level, and vertices and centres of cells of the second: all weights are 0, 1/2 or 1.
+    for size in [9, 5] {
+        shape.push(&[size], &[size as f32 - 1.0], usize::MAX);
+    }
+    let shape = Arc::new(shape);
+    for counts in COUNTS {
+        let points: Vec<f32> = counts.iter().enumerate().flat_map(|(k, &count)| vec![k as f32 / 8.0; count]).collect();
+        // Small integers, whose sums are exact in every order.
+        let upstream: Vec<f32> = (0..points.len() * shape.width()).map(|k| (k * 7 % 11) as f32 - 5.0).collect();
+        let mut wanted = vec![0.0f32; shape.parameter_count()];
+        for (x, upstream) in points.iter().zip(upstream.chunks(shape.width())) {
+            for (level, upstream) in shape.levels.iter().zip(upstream.chunks(shape.features)) {
+                let position = x * level.scale[0];
+                let low = position.floor().min(level.scale[0] - 1.0);
+                for (row, weight) in [(low as usize, 1.0 - (position - low)), (low as usize + 1, position - low)] {
+                    for (f, d) in upstream.iter().enumerate() {
+                        wanted[(level.first_row + row) * shape.features + f] += weight * d;
+                    }
+                }
+            }
+        }
+        for (name, device) in devices() {
+            poison(&device);
+            let device = device.autodiff();
+            let table = Tensor::<1>::zeros([shape.parameter_count()], &device).require_grad();
+            let count = points.len();
+            let given = Tensor::<2>::from_data(TensorData::new(points.clone(), [count, 1]), &device);
+            let weights = Tensor::<2>::from_data(TensorData::new(upstream.clone(), [count, shape.width()]), &device);
+            let gradients = (lookup(table.clone(), given, &shape).unwrap() * weights).sum().backward();
+            let found = to_vec(table.grad(&gradients).unwrap(), "gradient").unwrap();
+            assert!(found == wanted, "{name}, {counts:?}: {found:?} instead of {wanted:?}");
+        }
+    }
+}
+
+#[test]
+fn grids_without_features_are_refused() {
+    let device = Device::flex();
+    for shape in [GridShape { features: 0, ..planes() }, GridShape { levels: Vec::new(), ..planes() }] {
+        let found = lookup(Tensor::zeros([1], &device), Tensor::zeros([2, 2], &device), &Arc::new(shape));
+        let error = found.map(|_| ()).expect_err("no features").to_string();
+        assert!(error.contains("grid lookup") && error.contains("one level and one feature"), "{error}");
+    }
+}

@@ -15,17 +15,18 @@ use rayon::prelude::*;
 /// Rows per block.
 pub const BLOCK: usize = 128;
 
+/// What is not over 0 becomes 0, but NaN stays: it has to reach the loss, where the watchdog of a training finds it.
 #[inline(always)]
 fn relu(values: &mut [f32]) {
     for v in values {
-        *v = if *v > 0.0 { *v } else { 0.0 };
+        *v = if *v <= 0.0 { 0.0 } else { *v };
     }
 }
 
 #[inline(always)]
 fn relu_backward(grad: &mut [f32], output: &[f32]) {
     for (g, o) in grad.iter_mut().zip(output) {
-        *g = if *o > 0.0 { *g } else { 0.0 };
+        *g = if *o <= 0.0 { 0.0 } else { *g };
     }
 }
 
@@ -160,6 +161,17 @@ fn block_backward(layers: &[Layer], back: &[Vec<f32>], x: &[f32], outputs: &[Scr
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn relu_hides_no_nan() {
+        let mut values = [-1.0, -0.0, 0.0, 2.0, f32::NEG_INFINITY, f32::INFINITY, f32::NAN];
+        relu(&mut values);
+        assert_eq!(values[..6].iter().map(|v| v.to_bits()).collect::<Vec<u32>>(), [0.0, 0.0, 0.0, 2.0, 0.0, f32::INFINITY].map(f32::to_bits));
+        assert!(values[6].is_nan());
+        let mut grad = [3.0; 7];
+        relu_backward(&mut grad, &values);
+        assert_eq!(grad, [0.0, 0.0, 0.0, 3.0, 0.0, 3.0, 3.0]);
+    }
 
     #[test]
     fn rows_do_not_depend_on_how_many_there_are() {

@@ -1,6 +1,15 @@
-//! Mish and its derivative.
+//! ReLU, and Mish and its derivative.
 
+use crate::cube::tensor::is_number;
 use cubecl::prelude::*;
+
+/// Whether a ReLU turns `value` into 0, and passes no gradient where it did. NaN stays and passes its gradient: it has to reach the loss, where the watchdog of
+/// a training finds it.
+#[cube]
+pub fn relu_is_zero(value: f32) -> bool {
+    let number = is_number(value);
+    value <= 0.0 && number
+}
 
 /// e^x - 1 cannot cancel here: with w = e^x, tanh(ln(1 + w)) = (w^2 + 2 w) / (w^2 + 2 w + 2).
 #[cube]

@@ -1,6 +1,7 @@
 //! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W `[in, out]` row-major and then b `[out]`, at
 //! an offset. A thread computes one column of several rows, so that a weight is read once for all of them.
 
+use super::activation::relu_is_zero;
 use crate::cube::tensor::{THREADS, floats, workgroups_for};
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
@@ -43,7 +44,7 @@ fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, outp
             if first + r < rows as usize {
                 let mut value = sums[r] + bias;
                 if comptime!(relu) {
-                    value = select(value > 0.0, value, 0.0f32);
+                    value = select(relu_is_zero(value), 0.0f32, value);
                 }
                 y[y_at as usize + (first + r) * output + column] = value;
             }
@@ -88,8 +89,10 @@ fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32,
 /// dy becomes 0 where the output of a ReLU is.
 #[cube(launch)]
 fn mask_relu(dy: &mut [f32], y: &[f32]) {
-    if ABSOLUTE_POS < dy.len() && y[ABSOLUTE_POS] <= 0.0 {
-        dy[ABSOLUTE_POS] = 0.0;
+    if ABSOLUTE_POS < dy.len() {
+        if relu_is_zero(y[ABSOLUTE_POS]) {
+            dy[ABSOLUTE_POS] = 0.0;
+        }
     }
 }
 

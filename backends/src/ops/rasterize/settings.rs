@@ -6,8 +6,9 @@ use cc4dgs_core::{ParameterSpace, Rules};
 pub const TILE: usize = 16;
 /// Pixels of a tile.
 pub const TILE_PIXELS: usize = TILE * TILE;
-/// Upper bound on the (Gaussian, tile) pairs of one render, bounding boxes counted. A CPU needs at least 24 bytes of working memory per pair to draw (3.2 GB in
-/// all), 64 with the backward pass (8.6 GB), and 76 with largest weights and absolute gradients (10.2 GB).
+/// Upper bound on the (Gaussian, tile) pairs of one render. Processors count all tiles of bounding boxes, GPUs those that a footprint comes near. A CPU needs
+/// at least 24 bytes of working memory per pair to draw (3.2 GB in all), 64 with the backward pass (8.6 GB), and 76 with largest weights and absolute gradients
+/// (10.2 GB).
 pub const MAX_TILE_PAIRS: u64 = 1 << 27;
 
 /// Columns of a screen record: what a pixel reads of a Gaussian. Gradient records have the same columns.

@@ -9,6 +9,7 @@ use super::fields::{
     ACCUMULATE, AT, BIAS, COLUMN, FIELDS, FLAGS, KIND, LOAD, MASK, MULTIPLY, NONE, NORM, OUTPUT, OUTSIDE, RELOAD, RELU, SAVE, STRIDE, TARGET, TILE, WEIGHTS,
     WIDTH,
 };
+use crate::cube::field::activation::relu_is_zero;
 use crate::cube::field::decoder::signature;
 use cubecl::prelude::*;
 use layer_norm::{norm, norm_back};
@@ -216,7 +217,8 @@ fn multiply(
                     #[unroll]
                     for r in 0..BLOCK {
                         let sum = sums[r * BLOCK + c] + shift;
-                        let value = select((flags & RELU) != 0 && sum <= 0.0, 0.0f32, sum);
+                        let zero = relu_is_zero(sum);
+                        let value = select((flags & RELU) != 0 && zero, 0.0f32, sum);
                         if target == OUTSIDE {
                             if first + row + r < count {
                                 out[result + (first + row + r) * output + own] = value;
@@ -299,7 +301,8 @@ fn mask(tiles: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: 
         for k in 0..AHEAD {
             let own = index + k * comptime!(layout.threads());
             let (to, inside) = position(own, width, first, count, layout);
-            if inside && values[k] <= 0.0 {
+            let zero = relu_is_zero(values[k]);
+            if inside && zero {
                 tiles[target * (tile * stride) + to] = 0.0f32;
             }
         }
