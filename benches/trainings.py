@@ -46,11 +46,12 @@ class Rows:
 
 
 def events(out):
-    """The events of the run in the folder `out`; a line that was cut is none."""
+    """The events of the run in the folder `out`; a line that was cut is none. `seconds` are those of the line: in older logs some events have a later key of
+    this name."""
     log, found = out / "events.jsonl", []
     for line in log.read_text().splitlines() if log.exists() else []:
         try:
-            found.append(json.loads(line))
+            found.append(json.loads(line, object_pairs_hook=lambda pairs: dict(reversed(pairs))))
         except json.JSONDecodeError:
             continue
     return found

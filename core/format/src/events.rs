@@ -108,7 +108,8 @@ pub enum Event {
     StageFinished {
         /// The stage.
         stage: String,
-        /// Wall-clock time in seconds.
+        /// Wall-clock time in seconds. A line of a log has a key `seconds` of its own.
+        #[serde(rename = "stage_seconds", alias = "seconds")]
         seconds: f64,
         /// Gaussians at its end.
         gaussians: usize,

@@ -92,7 +92,8 @@ impl Schedule {
     pub fn progress(&self) -> f64 {
         let (iteration, length) = (self.iteration as f64, self.length as f64);
         let Some((after, share, planned)) = self.knee() else { return iteration / length };
-        if iteration <= after { iteration / planned } else { share + (1.0 - share) * (iteration - after) / (length - after) }
+        // Rounded, both shares together may be 1 + 2.2e-16 after the last iteration.
+        if iteration <= after { iteration / planned } else { (share + (1.0 - share) * (iteration - after) / (length - after)).min(1.0) }
     }
     /// The iteration, not rounded, after which `share` of the stage is done: the inverse of [`Schedule::progress`].
     pub fn iteration_at(&self, share: f64) -> f64 {
@@ -151,6 +152,14 @@ mod tests {
             let step = 0.8 / (length - 200) as f64;
             assert!((at(201).progress() - 0.2 - step).abs() < 1e-12);
             assert_eq!(at(1).at(3000), 150, "what lies before stays where it was");
+        }
+    }
+
+    #[test]
+    fn progress_is_1_after_the_last_iteration_of_any_length() {
+        for (after, planned, length) in [(10, 50, 51), (10, 50, 58), (5383, 26_919, 26_892), (5785, 28_926, 112_754)] {
+            let last = Schedule { iteration: length, settled: Some(Settled { after, planned }), ..Schedule::main(length) };
+            assert_eq!(last.progress(), 1.0, "{length} iterations where {planned} were planned");
         }
     }
 }

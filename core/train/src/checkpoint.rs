@@ -11,7 +11,7 @@ use cc4dgs_play::checkpoint::{CheckpointArrays, CheckpointFile, DeformerHeader, 
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::{Model, Moving};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Everything about a checkpoint that is not an array.
@@ -143,9 +143,10 @@ impl Checkpoint {
     }
 }
 
-/// The first setting that differs between two configurations, with both values.
+/// The first setting that differs between two configurations, with both values: that of a plug-in before its settings.
 fn first_difference(section: &str, then: &toml::Table, now: &toml::Table) -> Option<String> {
-    let keys: BTreeSet<&String> = then.keys().chain(now.keys()).collect();
+    let mut keys: Vec<&String> = then.keys().chain(now.keys()).collect();
+    keys.sort_by_key(|key| (key.as_str() != "kind", *key));
     let shown = |value: Option<&toml::Value>| value.map_or("nothing".to_string(), ToString::to_string);
     keys.into_iter().filter(|key| then.get(*key) != now.get(*key)).find_map(|key| {
         let name = if section.is_empty() { key.clone() } else { format!("{section}.{key}") };

@@ -123,7 +123,7 @@ pub struct HistoryPoint {
     pub gaussians: usize,
 }
 
-/// The seconds and the event of a line; `None` where it was cut. An event may have a key `seconds` of its own, so the line's is taken off first.
+/// The seconds and the event of a line; `None` where it was cut. Events of older logs may have a key `seconds` of their own, so the line's is taken off first.
 fn read_line(line: &str) -> Option<(f64, Event)> {
     let (seconds, event) = line.strip_prefix("{\"seconds\":")?.split_once(',')?;
     Some((seconds.parse().ok()?, serde_json::from_str(&format!("{{{event}")).ok()?))
@@ -237,6 +237,12 @@ mod tests {
         std::fs::write(&path, text.map(|(s, e)| line(s, e)).concat()).unwrap();
         let history = read_history(&path).unwrap();
         assert_eq!((history.seconds, history.resumed, history.stage_seconds["coarse"]), (10.0, 1, 2.0));
+
+        // A key of a line is there once; older logs have both times under one key.
+        let last = line(3.0, end("coarse"));
+        assert_eq!(last, "{\"seconds\":3.0,\"event\":\"stage-finished\",\"stage\":\"coarse\",\"stage_seconds\":1.0,\"gaussians\":5}\n");
+        assert_eq!(read_line(last.trim_end()), Some((3.0, end("coarse"))));
+        assert_eq!(read_line(&last.trim_end().replace("stage_seconds", "seconds")), Some((3.0, end("coarse"))));
     }
 
     #[test]

@@ -250,8 +250,12 @@ impl TrainConfig {
         if !(0.1..=100.0).contains(&t.mask_sigma) {
             return bad("mask_sigma", format!("{} pixels", t.mask_sigma), "Give 0.1 to 100 pixels");
         }
-        if !(0.0..=1.0).contains(&t.time_ramp) {
-            return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
+        if !(0.0..1.0).contains(&t.time_ramp) {
+            return bad(
+                "time_ramp",
+                format!("{} is not in 0..1, without 1", t.time_ramp),
+                "It is the share of the main stage after which the last frame is trained on",
+            );
         }
         if let Some((key, rate)) = t.lr.rates().into_iter().find(|(_, rate)| !(*rate >= 0.0 && rate.is_finite())) {
             return bad(&format!("lr.{key}"), rate.to_string(), "Give a learning rate of 0 or more");
@@ -305,6 +309,7 @@ impl TrainConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::Settled;
 
     #[test]
     fn rates_fall_at_the_end_of_the_main_stage_alone() {
@@ -315,6 +320,9 @@ mod tests {
         assert_eq!(at(Stage::Coarse, 1000), 2.0);
         let without = TrainConfig { lr: GaussianRates::default(), ..train.clone() };
         assert_eq!(without.rate_scale(&Schedule { iteration: 1000, ..Schedule::main(1000) }, 4), 1.0);
+        // The length was changed after a fifth of the stage.
+        let settled = Some(Settled { after: 10, planned: 50 });
+        assert_eq!(without.rate_scale(&Schedule { iteration: 51, settled, ..Schedule::main(51) }, 4), 1.0);
     }
 
     #[test]

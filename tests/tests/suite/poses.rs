@@ -12,7 +12,7 @@ use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::train::{TrainJob, train};
 use glam::{DMat3, DVec3};
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicUsize};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// Radians by which cameras are turned, and units of the scene by which they are moved, about.
@@ -77,6 +77,30 @@ fn cameras_that_stand_elsewhere_are_found() {
 }
 
 #[test]
+fn who_scores_training_views_is_told_whose_poses_they_have() {
+    let warnings = Arc::new(AtomicUsize::new(0));
+    let counted = warnings.clone();
+    let listener = move |event: &Event| {
+        if let Event::Warning { message, .. } = event
+            && message.contains("poses of the dataset")
+        {
+            counted.fetch_add(1, Ordering::Relaxed);
+        }
+    };
+    let session = Session::builder().device("flex").on_event(listener).build().unwrap();
+    for (poses, of_training_views) in [("poses.kind=refined", 1), ("poses.kind=none", 0)] {
+        let config = config(&session, poses, 40);
+        let scene = Arc::new(displaced(&session, &config));
+        let model = session.train(&config, scene.clone(), None).unwrap();
+        for (split, expected) in [(Split::Train, of_training_views), (Split::Test, 0)] {
+            warnings.store(0, Ordering::Relaxed);
+            session.evaluate(&model, &scene, split).unwrap();
+            assert_eq!(warnings.load(Ordering::Relaxed), expected, "{poses}, {split:?}");
+        }
+    }
+}
+
+#[test]
 fn a_resumed_run_continues_with_the_poses_it_had() {
     let session = Session::builder().device("flex").build().unwrap();
     let mut config = config(&session, "poses={kind='refined', identity=0.5}", 40);
@@ -131,6 +155,8 @@ enum Mistake {
     Together,
     /// So they may, but not along (1, 1, 1).
     TogetherAcross,
+    /// A camera that is the only one may move.
+    Single,
     /// A camera that does not exist is taken for the first.
     Beyond,
 }
@@ -141,6 +167,7 @@ impl Poses for Shifted {
         let centred = match self.mistake {
             Mistake::Together => all.clone(),
             Mistake::TogetherAcross => all.clone() - all.clone().mean_dim(0).mean_dim(1),
+            Mistake::Single if all.dims()[0] == 1 => all.clone(),
             _ => all.clone() - all.clone().mean_dim(0),
         };
         let index = if index >= all.dims()[0] && self.mistake == Mistake::Beyond { 0 } else { index };
@@ -188,13 +215,14 @@ type Build = fn(&toml::Table, &PosesContext, &Device) -> Result<Box<dyn Poses>>;
 
 #[test]
 fn mistakes_of_pose_models_are_found() {
-    let cases: [(Build, &str); 7] = [
+    let cases: [(Build, &str); 8] = [
         (|settings, context, device| build_shifted(Mistake::None, settings, context, device), ""),
         (|settings, context, device| build_shifted(Mistake::Opposite, settings, context, device), "per unit along a direction"),
         (|settings, context, device| build_shifted(Mistake::Partial, settings, context, device), "per unit along a direction"),
         (|settings, context, device| build_shifted(Mistake::TogetherAcross, settings, context, device), "where all weights change alike"),
         (|settings, context, device| build_shifted(Mistake::Stretched, settings, context, device), "is not rigid"),
         (|settings, context, device| build_shifted(Mistake::Together, settings, context, device), "where all weights change alike"),
+        (|settings, context, device| build_shifted(Mistake::Single, settings, context, device), "a single camera moves"),
         (|settings, context, device| build_shifted(Mistake::Beyond, settings, context, device), "is no error"),
     ];
     for (build, wanted) in cases {

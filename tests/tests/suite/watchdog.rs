@@ -10,15 +10,15 @@ use cc4dgs_train::train::{TrainJob, train};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// Calls of the term that breaks once.
-static ONCE: AtomicUsize = AtomicUsize::new(0);
-
 /// Adds NaN to the loss: `when = "once"` in one call at iteration 130 of the main stage, `"always"` from there on, `"opaque"` where an opacity logit is over
 /// 30, `"never"` nowhere. The default is the mean of the planes, which conforms, because the conformance suite runs for every registered term.
 #[derive(Default, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Poison {
     when: String,
+    /// Calls of the term in the iteration in which it breaks once.
+    #[serde(skip)]
+    calls: AtomicUsize,
 }
 
 impl LossTerm for Poison {
@@ -27,7 +27,7 @@ impl LossTerm for Poison {
         let breaks = match self.when.as_str() {
             "" => return Ok(Some(input.planes.clone().mean())),
             // Two views of the same iteration, or the search for the term's name, may call it again.
-            "once" => late && input.schedule.iteration == 130 && ONCE.fetch_add(1, Ordering::SeqCst) < 2,
+            "once" => late && input.schedule.iteration == 130 && self.calls.fetch_add(1, Ordering::SeqCst) < 2,
             "always" => late,
             "opaque" => input.gaussians.opacity_logits.clone().inner().max().into_scalar::<f32>() > 30.0,
             _ => false,

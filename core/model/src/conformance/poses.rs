@@ -21,7 +21,7 @@ const EXACT: f64 = 1e-5;
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - A new model leaves all poses as they are.
 /// - With any weights poses are rigid, and the camera is otherwise unchanged. A camera that does not exist is an error, unless no pose is ever changed.
-/// - The same change of all weights changes no pose: cameras cannot move together.
+/// - The same change of all weights changes no pose: cameras cannot move together. So a single camera keeps its pose, whatever the weights.
 /// - Gradients of the weights, through the probe, agree with finite differences of the pose.
 /// - Parameters have unique names, matching shapes and existing groups.
 pub fn poses(plugin: &PosesPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
@@ -34,6 +34,7 @@ pub fn poses(plugin: &PosesPlugin, settings: &toml::Table, device: &Device) -> V
             ("identity", Box::new(|| suite.new_models_change_nothing())),
             ("rigid", Box::new(|| suite.poses_are_rigid())),
             ("together", Box::new(|| suite.cameras_do_not_move_together())),
+            ("single", Box::new(|| suite.a_single_camera_keeps_its_pose())),
             ("gradients", Box::new(|| suite.gradients_are_slopes())),
         ],
     )
@@ -131,6 +132,16 @@ impl Suite<'_> {
             }
         }
         Ok(None)
+    }
+    fn a_single_camera_keeps_its_pose(&self) -> Result<Option<String>> {
+        let mut single = (self.plugin.build)(self.settings, &PosesContext { cameras: 1, extent: EXTENT, seed: Seed::root(71) }, self.device)?;
+        weights::change(single.parameters_mut(), self.device, |index, k| SHAKE * uniform(Seed::root(81).index(index as u64), k))?;
+        let difference = largest_difference(&pose(single.as_ref(), 0)?, &camera(0).world_to_camera);
+        if !within(difference, EXACT) {
+            return Ok(Some(format!("a single camera moves: its pose changes by {difference}")));
+        }
+        let term = single.regularizer()?.map(|term| to_vec(term, "regularizer")).transpose()?.unwrap_or_default();
+        Ok(term.iter().any(|value| !value.is_finite()).then(|| format!("the regularizer of a single camera is {term:?}")))
     }
     fn gradients_are_slopes(&self) -> Result<Option<String>> {
         let device = self.device.clone().autodiff();

@@ -65,7 +65,7 @@ pub enum MaskRule {
 pub struct FrameSet {
     /// The side of the split.
     pub split: Split,
-    /// Number of images that the mean is over, evenly spread.
+    /// Number of images that are scored, evenly spread. The mean of a masked metric is over those of them in which the mask has a pixel.
     pub count: usize,
     /// Number of images of the split.
     pub of: usize,
