@@ -171,7 +171,7 @@ impl Scored {
 pub type OnImage<'a> = dyn FnMut(usize, &Image8, &Image8, &ImageScore) -> Result<()> + 'a;
 
 /// Renders the views that `scored` names and scores them. A model without a background of its own is drawn on the
-/// scene's.
+/// scene's. Training views of a model whose training corrected their poses are drawn at those of the scene, with a warning.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a split without views, and what scene, field, rasterizer and `on_image` report.
@@ -186,6 +186,14 @@ pub fn evaluate(
 ) -> Result<EvalReport> {
     let Scored { split, perceptual, .. } = scored;
     scored.check(scene)?;
+    if split == Split::Train
+        && let Some(kind) = model.provenance.config.get("poses").and_then(|poses| poses.get("kind")?.as_str()).filter(|kind| *kind != "none")
+    {
+        let message = format!(
+            "trained with corrected poses of its cameras (poses.kind = \"{kind}\"), which models do not keep: training views are scored at the poses of the dataset"
+        );
+        events.emit(&Event::Warning { object: "model".into(), message });
+    }
     let (views, in_split) = (scored.views(scene), scene.split(split).len());
     let background = model.background_on(scene.background);
     let mut player = Player::new(model, registry, device)?.on(scene.background);
@@ -319,8 +327,21 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     (count > 0).then(|| sum / count as f64)
 }
 
+/// The middle one of `values`, or the mean of the two in the middle; 0 of none.
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_unstable_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
+    let (last, at) = (values.len().saturating_sub(1), |index: usize| values.get(index).copied().unwrap_or(0.0));
+    0.5 * (at(last / 2) + at(last.div_ceil(2)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians_lie_in_the_middle() {
+        let of = |values: &[f64]| median(values.iter().copied());
+        assert_eq!([of(&[]), of(&[7.0]), of(&[4.0, 1.0]), of(&[9.0, 1.0, 2.0]), of(&[8.0, 1.0, 2.0, 4.0])], [0.0, 7.0, 2.5, 2.0, 3.0]);
+    }
 }

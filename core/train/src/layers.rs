@@ -16,12 +16,13 @@ pub struct Layers {
 }
 
 impl Layers {
-    /// Layers a preset, a TOML file and `key=value` overrides, in that order. Without `preset`, or with an empty one, the preset that the file names.
+    /// Layers a preset, a TOML file and `key=value` overrides, in that order. Without `preset`, or with an empty one, the preset that the file names; else that
+    /// name has no effect.
     ///
     /// # Errors
     /// [`Error::Parameter`] for unknown presets, text that is not TOML and keys of earlier versions; [`Error::Io`] for the file.
     pub fn collect(registry: &Registry, preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
-        let from_file = match file {
+        let mut from_file = match file {
             Some(path) => {
                 let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
                 config::parse_table(&path.display().to_string(), &text)?
@@ -29,7 +30,12 @@ impl Layers {
             None => toml::Table::new(),
         };
         let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
-        let preset = match preset.filter(|p| !p.is_empty()).map(str::to_string).or(named) {
+        let stated = preset.filter(|p| !p.is_empty()).map(str::to_string);
+        if stated.is_some() {
+            // Its name would take the place of the stated one, and decide whether there is a plan to make.
+            from_file.remove("preset");
+        }
+        let preset = match stated.or(named) {
             Some(name) => registry.preset(&name)?,
             None => toml::Table::new(),
         };
@@ -144,6 +150,18 @@ mod tests {
         let base = "[train]\niterations = 3\nbatch = 4".parse().unwrap();
         let config = done.over(&base).config().unwrap();
         assert_eq!((config.train.iterations, config.train.batch), (7, 4));
+    }
+
+    #[test]
+    fn a_stated_preset_takes_the_place_of_the_one_that_the_file_names() {
+        let (folder, registry) = (tempfile::tempdir().unwrap(), Registry::collect().unwrap());
+        let file = folder.path().join("config.toml");
+        std::fs::write(&file, "preset = 'demo'\n[train]\nbatch = 3\n").unwrap();
+        for (stated, name, plans) in [(Some("auto+hexplane"), "auto+hexplane", true), (Some(""), "demo", false), (None, "demo", false)] {
+            let layers = Layers::collect(&registry, stated, Some(file.as_path()), &[]).unwrap();
+            assert_eq!((layers.table()["preset"].as_str(), layers.want_plan()), (Some(name), plans), "{stated:?}");
+            assert!(layers.state("train.batch"), "the file's settings hold");
+        }
     }
 
     #[test]

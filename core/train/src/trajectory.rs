@@ -31,8 +31,8 @@ pub struct MotionScore {
     /// Root-mean-square distance of their displacements since then from the true ones, over all frames at which they can be seen, as a share of the
     /// true displacement's root-mean-square: 0 follows exactly, 1 is as good as not moving. None without Gaussians or true displacements.
     pub trajectory_error: Option<f64>,
-    /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it ever covers for a camera that takes all frames, those of the
-    /// image's own frame for a moving camera. None where there are none.
+    /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it covers at one of 24 moments, evenly spread over the sequence, for a
+    /// camera that takes all frames, those of the image's own frame for a moving camera. None where there are none.
     pub psnr_db: Option<f64>,
 }
 

@@ -28,6 +28,9 @@ const ERROR_SCALE: f32 = 0.2;
 const FLICKER_SCALE: f32 = 0.1;
 /// Most frames that a flicker map is taken over.
 const FLICKER_FRAMES: usize = 48;
+/// What to do about damaged images. A cell with a result is not run again, whatever became of its images.
+const REMEDY: &str =
+    "Remove the file, and the page leaves its image out. `sweep run` draws it again once the cell's file in the folder results is removed, too";
 
 /// The contact sheets, sliders and flicker maps of a scene, as HTML; empty where the folder has no images of it.
 ///
@@ -82,7 +85,7 @@ fn read(folder: &Path, name: &str) -> Result<Image8> {
     let mut limits = image::Limits::default();
     (limits.max_image_width, limits.max_image_height) = (Some(MOST_PIXELS), Some(MOST_PIXELS));
     reader.limits(limits);
-    let rgb = reader.decode().map_err(|e| Error::data(name, format!("not a PNG image: {e}"), "Remove the file and run the cell again"))?.to_rgb8();
+    let rgb = reader.decode().map_err(|e| Error::data(name, format!("not a PNG image: {e}"), REMEDY))?.to_rgb8();
     let (width, height) = rgb.dimensions();
     Ok(Image8 { width, height, channels: 3, data: rgb.into_raw() })
 }
@@ -91,7 +94,7 @@ fn read_pair(folder: &Path, truth: &str, render: &str) -> Result<(Image8, Image8
     let (a, b) = (read(folder, truth)?, read(folder, render)?);
     if (a.width, a.height) != (b.width, b.height) {
         let problem = format!("{}x{} pixels, its ground truth {truth} has {}x{}", b.width, b.height, a.width, a.height);
-        return Err(Error::data(render, problem, "Remove the files and run the cell again"));
+        return Err(Error::data(render, problem, REMEDY));
     }
     Ok((a, b))
 }
@@ -213,11 +216,7 @@ fn flicker(folder: &Path, shown: &[(&Row, &CellResult)]) -> Result<String> {
             sums.resize(now.0.data.len() / 3, 0);
             if let Some((truth, render)) = &before {
                 if truth.data.len() != now.0.data.len() {
-                    return Err(Error::data(
-                        format!("{}, camera {camera}", row.name()),
-                        "its images differ in size",
-                        "Remove the files and run the cell again",
-                    ));
+                    return Err(Error::data(format!("{}, camera {camera}", row.name()), "its images differ in size", REMEDY));
                 }
                 let change = |i: usize| (i32::from(now.1.data[i]) - i32::from(render.data[i])) - (i32::from(now.0.data[i]) - i32::from(truth.data[i]));
                 sums.iter_mut().enumerate().for_each(|(p, sum)| *sum += (0..3).map(|c| u64::from(change(3 * p + c).unsigned_abs())).sum::<u64>());

@@ -3,7 +3,7 @@
 use super::rows::{Better, QUANTITIES, Quantity, Row, TRAINING};
 use super::text;
 use crate::sweep::{TrainingDevices, csv_field, mixture_notes, trained_on};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
 /// One cell.
@@ -39,7 +39,7 @@ pub struct Table {
 
 /// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds. The best mean of a column is marked
 /// where there are several of trainings that did not fail; those that did are never the best. Times of trainings that ran on different devices state these, and
-/// none is the best.
+/// none is the best. Notes state why values of these quantities are missing, every reason once.
 pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], trained: &TrainingDevices) -> Table {
     let settings = rows.iter().any(|row| row.setting != "base");
     let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
@@ -58,10 +58,16 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
             line.into_iter().map(Cell::plain).collect()
         })
         .collect();
-    let mut notes = Vec::new();
+    let (mut notes, mut absent) = (Vec::new(), Vec::new());
     for quantity in quantities {
         let spreads: Vec<_> = rows.iter().map(|row| row.spread(quantity)).collect();
-        if spreads.iter().all(Option::is_none) {
+        let has_column = spreads.iter().any(Option::is_some);
+        let reasons: BTreeSet<&str> = rows.iter().flat_map(|row| &row.cells).filter_map(|cell| cell.absent.get(quantity.key)).map(String::as_str).collect();
+        if !reasons.is_empty() {
+            let said = if has_column { "is missing where it says –" } else { "is not in this table" };
+            absent.push(format!("{} {said}: {}", quantity.name, reasons.into_iter().collect::<Vec<_>>().join("; ")));
+        }
+        if !has_column {
             continue;
         }
         let arrow = match quantity.better {
@@ -93,9 +99,8 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
             format!("† {}: {why}", row.training())
         })
         .collect();
-    notes.extend(hopeless.into_iter().collect::<std::collections::BTreeSet<_>>());
-    let absent: BTreeMap<&str, &str> = rows.iter().flat_map(|r| &r.cells).flat_map(|c| &c.absent).map(|(name, why)| (name.as_str(), why.as_str())).collect();
-    notes.extend(absent.into_iter().map(|(name, why)| format!("{name} is missing where it says –: {why}")));
+    notes.extend(hopeless.into_iter().collect::<BTreeSet<_>>());
+    notes.extend(absent);
     Table { title: scene.to_string(), head, text_columns, rows: lines, notes }
 }
 
@@ -198,4 +203,34 @@ pub fn csv(scenes: &BTreeMap<&str, Vec<Row>>) -> String {
         out += &(fields.join(",") + "\n");
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::rows::{LPIPS, PSNR, rows};
+    use super::*;
+    use crate::sweep::CellResult;
+
+    #[test]
+    fn reasons_are_those_of_the_columns_and_all_of_them() {
+        let text = include_str!("../../../../docs/results.md");
+        let json = text.split("```json\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        let cell = |id: &str, why: &str| {
+            let mut cell = CellResult::from_json("docs/results.md", json).unwrap();
+            (cell.id, cell.axes.method) = (id.into(), id.into());
+            cell.absent = ["lpips", "ssim_dynamic"].map(|name| (name.to_string(), why.to_string())).into();
+            cell
+        };
+        let notes = |cells: &[CellResult], quantities: &[&Quantity]| {
+            let scenes = rows(cells).unwrap();
+            summary("mutant", &scenes["mutant"], quantities, &TrainingDevices::of(cells)).notes
+        };
+        let mut cells = vec![cell("a", "too small"), cell("b", "no weights"), cell("c", "no weights")];
+        assert_eq!(notes(&cells, &[&PSNR, &LPIPS]), ["LPIPS is not in this table: no weights; too small"]);
+        assert!(notes(&cells, &[&PSNR]).is_empty(), "no column of it was asked for");
+        let score = cells[1].metrics["psnr_db"].clone();
+        cells[1].metrics.insert("lpips".into(), score);
+        cells[1].absent.clear();
+        assert_eq!(notes(&cells, &[&PSNR, &LPIPS]), ["LPIPS is missing where it says –: no weights; too small"]);
+    }
 }

@@ -315,7 +315,7 @@ fn strings_of_results_cannot_leave_their_place() {
         cell.axes.method = format!("{}{EVIL}", cell.axes.method);
         cell.axes.codec = format!("{}{EVIL}", cell.axes.codec);
         (cell.outcome, cell.message) = (Outcome::Hopeless, Some(EVIL.into()));
-        cell.absent = BTreeMap::from([(EVIL.into(), EVIL.into())]);
+        cell.absent = BTreeMap::from([("lpips".into(), EVIL.into())]);
         cell.provenance.commit = EVIL.into();
         cell.provenance.data.path = EVIL.into();
         cell.provenance.device.processor = EVIL.into();
@@ -372,7 +372,7 @@ fn what_does_not_belong_together_is_refused() {
     std::fs::remove_dir_all(folder.join("results")).unwrap();
     write(&folder, &cells);
     let error = report(&folder, &ReportOptions::default()).unwrap_err().to_string();
-    assert!(error.contains("not a PNG image") && error.contains("images/cdf/1.png"), "{error}");
+    assert!(error.contains("not a PNG image") && error.contains("images/cdf/1.png") && error.contains("file in the folder results"), "{error}");
     let options = |text: &str| ReportOptions { only: vec![text.into()], images: ImageChoice::None, ..Default::default() };
     assert_eq!(report(&folder, &options("method=cdf")).unwrap().cells, 4);
     let error = report(&folder, &options("method=none")).unwrap_err().to_string();

@@ -1,8 +1,8 @@
 //! A grid: scenes x methods x settings x codecs x seeds, as a TOML file. `docs/sweeps.md` describes the keys.
 
-use super::location::locate;
 use super::overruled::refuse_overruled;
 use super::result::CodecChoice;
+use super::settings::{Settings, of_file};
 use crate::auto::PRESET as AUTO;
 use cc4dgs_core::{Error, Result, Split, config};
 use serde::de::DeserializeOwned;
@@ -119,27 +119,9 @@ impl<T> Axis<T> {
     fn sizes(axis: &[Self]) -> impl Iterator<Item = f64> + '_ {
         axis.iter().map(|value| value.size)
     }
-    /// The settings of its file, then its own, as `key=value`: a plan does not change with the file.
-    pub(super) fn settings(&self) -> Result<Vec<String>> {
-        let mut all = Vec::new();
-        if let Some(text) = &self.config {
-            let path = locate(text)?;
-            let content = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
-            assignments(&config::parse_table(&path.display().to_string(), &content)?, "", &mut all);
-        }
-        all.extend_from_slice(&self.set);
-        Ok(all)
-    }
-}
-
-/// Every value of `table` as `key.of.tables=value`. A table with keys that have no such form, such as names of cameras with a dot, is one value.
-fn assignments(table: &toml::Table, prefix: &str, to: &mut Vec<String>) {
-    let has_form = |key: &String| !key.is_empty() && key.trim() == key && !key.contains(['.', '=']);
-    for (key, value) in table {
-        match value {
-            toml::Value::Table(inner) if inner.keys().all(has_form) => assignments(inner, &format!("{prefix}{key}."), to),
-            value => to.push(format!("{prefix}{key}={value}")),
-        }
+    /// The settings of its file, and its own.
+    pub(super) fn settings(&self) -> Result<Settings<'_>> {
+        Ok(Settings { file: self.config.as_deref().map_or(Ok(Vec::new()), of_file)?, set: &self.set })
     }
 }
 
@@ -337,10 +319,12 @@ mod tests {
     fn a_file_of_settings_comes_before_those_of_its_axis() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("reference.toml");
-        std::fs::write(&file, "seed = 9\n[train]\niterations = 5\nbatch = 2\n[train.lr]\nmeans = 0.5\n[[loss]]\nkind = 'l1'\nweight = 1.0\n").unwrap();
+        std::fs::write(&file, "preset = 'auto'\nseed = 9\n[train]\niterations = 5\nbatch = 2\n[train.lr]\nmeans = 0.5\n[[loss]]\nkind = 'l1'\nweight = 1.0\n")
+            .unwrap();
         let method = |config: &str| {
             let text = format!("[[method]]\nname = 'x'\npreset = ''\nconfig = '{config}'\nset = ['train.batch=3']\n");
-            Grid::parse("g.toml", &format!("{SMALL}{text}")).unwrap().method.remove(1).settings()
+            let method = Grid::parse("g.toml", &format!("{SMALL}{text}")).unwrap().method.remove(1);
+            method.settings().map(|own| [own.file.as_slice(), own.set].concat())
         };
         let mut made = toml::Table::new();
         config::set_all(&mut made, &method(&file.display().to_string()).unwrap()).unwrap();

@@ -20,6 +20,7 @@ mod plan;
 mod read;
 mod result;
 mod run;
+mod settings;
 mod table;
 mod trained;
 mod training;

@@ -99,7 +99,7 @@ fn refuse_settings(grid: &Grid, set: &[String]) -> Result<()> {
 }
 
 /// The value at `path`, such as `train.iterations`.
-fn value_at<'a>(table: &'a toml::Table, path: &str) -> Option<&'a toml::Value> {
+pub(super) fn value_at<'a>(table: &'a toml::Table, path: &str) -> Option<&'a toml::Value> {
     let mut keys = path.split('.');
     let first = table.get(keys.next()?);
     keys.fold(first, |value, key| value?.get(key))

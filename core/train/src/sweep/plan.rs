@@ -6,6 +6,7 @@ use super::hash::{ContentHash, name_of};
 use super::location::locate;
 use super::overruled::refuse_minutes;
 use super::result::{CodecChoice, DataFingerprint};
+use super::settings::{Settings, laid_over};
 use super::views::refuse_too_few;
 use crate::code;
 use crate::config::RunConfig;
@@ -132,7 +133,7 @@ impl Plan {
             let listing = listing(&locate(&scene.own.path)?)?;
             for (method, setting) in grid.method.iter().flat_map(|method| grid.setting.iter().map(move |setting| (method, setting))) {
                 for &seed in &grid.seeds {
-                    let mut training = planned(grid, scene, method, setting, seed, data.clone(), listing.clone())?;
+                    let mut training = planned(grid, scene, method, setting, seed, data.clone(), listing.clone(), registry)?;
                     let stated = stated(grid, &training, registry, check).map_err(|error| at(&training, error))?;
                     training.id = name_of(&(&stated, &data.hash, version, commit, seed))?;
                     if let Some(other) = labels.insert(training.id.clone(), training.label()) {
@@ -277,6 +278,7 @@ fn planned(
     seed: u64,
     data: DataFingerprint,
     listing: String,
+    registry: &Registry,
 ) -> Result<PlannedTraining> {
     let preset = match method.own.preset.strip_prefix('+') {
         Some("") => scene.own.family().into(),
@@ -284,8 +286,9 @@ fn planned(
         None => method.own.preset.clone(),
     };
     let size = scene.size * method.size * setting.size;
-    let mut sets = grid.set.clone();
-    sets.extend(scene.settings()?.into_iter().chain(method.settings()?).chain(setting.settings()?));
+    // A preset that does not exist is refused with the name of the training, when its layers are read.
+    let below = registry.preset(&preset).unwrap_or_default();
+    let mut sets = laid_over(below, vec![Settings { file: Vec::new(), set: &grid.set }, scene.settings()?, method.settings()?, setting.settings()?])?;
     if let Some(iterations) = grid.iterations {
         sets.push(format!("train.iterations={}", (iterations as f64 * size).round().max(1.0)));
     }
@@ -331,20 +334,25 @@ fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &
 
 /// Refuses trainings of one scene whose images would have different sizes, of which no table is made: where no size is stated, `auto` chooses it by the minutes.
 fn refuse_image_sizes(trainings: &[PlannedTraining], registry: &Registry) -> Result<()> {
-    let mut chosen: BTreeMap<&str, &PlannedTraining> = BTreeMap::new();
-    for training in trainings.iter().filter(|training| training.minutes.is_some()) {
-        let scene = training.layers(registry)?.config()?.scene;
-        if scene.width > 0 || scene.height > 0 || scene.downscale != 1.0 {
+    let mut chosen: BTreeMap<&str, (&PlannedTraining, Option<f64>)> = BTreeMap::new();
+    for training in trainings {
+        let layers = training.layers(registry)?;
+        let config = layers.config()?;
+        let scene = &config.scene;
+        if !layers.want_plan() || scene.width > 0 || scene.height > 0 || scene.downscale != 1.0 {
             continue;
         }
-        let first = *chosen.entry(&training.scene).or_insert(training);
-        if first.minutes != training.minutes {
-            let of = |training: &PlannedTraining| {
-                let minutes = training.minutes.unwrap_or_default();
-                format!("'{}' has {minutes} {}", training.label(), plural(minutes, "minute", "minutes"))
+        let minutes = config.auto.minutes;
+        let (first, of_first) = *chosen.entry(&training.scene).or_insert((training, minutes));
+        if of_first != minutes {
+            let of = |training: &PlannedTraining, minutes: Option<f64>| match minutes {
+                Some(minutes) => format!("'{}' has {minutes} {}", training.label(), plural(minutes, "minute", "minutes")),
+                None => format!("'{}' has the minutes of its preset", training.label()),
             };
-            let problem = format!("{} and {}: `auto` may choose another image size for each, and no table compares these", of(first), of(training));
-            let remedy = "State scene.width, scene.height or scene.downscale in `set` of the grid or of the scene, or leave `size` out";
+            let both = format!("{} and {}", of(first, of_first), of(training, minutes));
+            let problem = format!("{both}: `auto` may choose another image size for each, and no table compares these");
+            let remedy =
+                "State scene.width, scene.height or scene.downscale in `set` of the grid or of the scene, or the same time for all (`size`, auto.minutes)";
             return Err(Error::parameter("size", problem, remedy));
         }
     }

@@ -23,7 +23,7 @@ fn trainings(text: &str) -> Result<Vec<(PlannedTraining, toml::Table)>> {
     let mut all = Vec::new();
     for (method, setting) in grid.method.iter().flat_map(|m| grid.setting.iter().map(move |s| (m, s))) {
         for &seed in &grid.seeds {
-            let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new())?;
+            let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new(), &registry)?;
             let layers = training.layers(&registry)?;
             layers.config().map_err(|error| at(&training, error))?;
             all.push((training, layers.table().clone()));
@@ -47,6 +47,18 @@ fn axes_are_multiplied_and_sized() {
     assert_eq!((all[1].1["seed"].as_integer(), all[1].1["device"].as_str()), (Some(4), Some("flex")));
     let validation = trainings(&format!("split = 'validation'\n---{METHODS}{CODEC}")).unwrap();
     assert_eq!(validation[0].1["train"]["validation"].as_integer(), Some(12));
+}
+
+#[test]
+fn a_changed_kind_drops_the_settings_of_a_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("config.toml");
+    std::fs::write(&file, "[density]\nkind = 'mcmc'\nrelocate = 0\n[train]\nbatch = 3\n").unwrap();
+    let method = format!("[[method]]\nname = 'm'\npreset = 'demo'\nconfig = '{}'\n", file.display());
+    let settings = "[[setting]]\nname = 'same'\n[[setting]]\nname = 'other'\nset = ['density.kind=clone-split', 'density.every=50']\n";
+    let all = trainings(&format!("{method}{settings}{CODEC}")).unwrap();
+    assert_eq!((all[0].1["density"]["relocate"].as_integer(), all[1].1["train"]["batch"].as_integer()), (Some(0), Some(3)));
+    assert_eq!(all[1].1["density"], toml::Value::Table("kind = 'clone-split'\nevery = 50".parse().unwrap()));
 }
 
 #[test]
@@ -75,6 +87,22 @@ fn images_of_a_scene_have_one_size_in_any_time() {
     }
     for stated in ["'scene.width=320'", "'scene.height=200'", "'scene.downscale=2.0'"] {
         assert_eq!(refused(stated), Ok(()));
+    }
+}
+
+#[test]
+fn minutes_of_a_set_count_for_the_size_of_images() {
+    let preset = |name: &str, preset: &str| format!("[[method]]\nname = '{name}'\npreset = '{preset}'\n");
+    let methods = format!("{}{}{}set = ['auto.minutes=7']\n", preset("a", "demo"), preset("b", "auto"), preset("c", "auto"));
+    let refused = |set: &str| {
+        let all: Vec<PlannedTraining> = trainings(&format!("set = [{set}]\n---{methods}{CODEC}")).unwrap().into_iter().map(|(t, _)| t).collect();
+        refuse_image_sizes(&all, &Registry::collect().unwrap()).map_err(|error| error.to_string())
+    };
+    let message = refused("").unwrap_err();
+    let parts = ["tiny b base seed 0' has the minutes of its preset", "tiny c base seed 0' has 7 minutes", "auto.minutes"];
+    assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    for equal in ["'scene.width=320'", "'auto.minutes=7'"] {
+        assert_eq!(refused(equal), Ok(()));
     }
 }
 
