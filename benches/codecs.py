@@ -3,8 +3,9 @@
 
     benches/codecs.py --cc4dgs target/release/cc4dgs --out benches/results/NAME [--codecs raw,quantize,...] [--ablation] MODEL=NAME[:SCENE]...
 
-With SCENE, PSNR and SSIM are those of `cc4dgs eval` on the test views, and codecs are given the scene. Without, a model is rendered from an orbit before and
-after by the example `compare`, which lies beside the program, and PSNR is between the two. Writes NAME.json and NAME.md, which hold numbers only.
+With SCENE, PSNR and SSIM are those of `cc4dgs eval` on the test views, and codecs that make use of the scene are given it. Without, a model is rendered from
+an orbit before and after by the example `compare`, which lies beside the program, and PSNR is between the two. Writes NAME.json and NAME.md, which hold
+numbers only.
 
 With a scene, `compact` has two rows: `finetune=0` and as it comes. `--ablation` adds rows of `compact`, each with an idea switched off that has an effect on the
 model, and a table of them by stream. Without a scene, all of them aim at the same estimated PSNR: compare sizes beside the PSNR.
@@ -49,7 +50,9 @@ def between(program, model, other):
 def measure(program, model, scene, codec, weights, settings, before, folder):
     archive = pathlib.Path(folder) / f"{re.sub('[^a-z0-9]', '-', codec)}.cc4d"
     chosen = [part for s in settings for part in ("--set", s)]
-    with_scene = ["--scene", scene] if scene else []
+    # `compress` refuses a scene that is of no use: it measures for `compact`, and files of other programs get its background.
+    uses_scene = "compact" in {codec.split(":")[0], weights.split(":")[0]} or pathlib.Path(model).suffix in {".ply", ".spz"}
+    with_scene = ["--scene", scene] if scene and uses_scene else []
     text, peak_mb = measured(program, "compress", model, "--codec", codec, "--field-weights", weights, "--out", archive, "--overwrite", "--json", "-", *chosen, *with_scene)
     report = json.loads(text)
     row = {

@@ -89,6 +89,7 @@ fn mistakes_end_with_their_own_exit_code() {
         ("compress x --orbit 16 --set scene.width=9 --out y.cc4d", "scene options without --scene"),
         ("compress x --orbit 16 --scene y --out y.cc4d", "cannot be used with"),
         ("compress x --orbit 11 --out y.cc4d", "12 to 512 views"),
+        ("compress x --orbit 16 --out y.cc4d", "--orbit 16: it has no effect on the codec cca:default"),
         ("bake x --field-weights compact:max-drop=0.01dB --out y.cc4d", "(--scene), or state the bits"),
     ] {
         let said = fail(&args.split(' ').collect::<Vec<_>>(), 2);

@@ -15,6 +15,10 @@ const OF_SPZ_BYTE: u64 = 11;
 /// What a PLY file takes per byte of its own.
 const OF_PLY_BYTE: u64 = 3;
 
+/// Names of streams with the ranks of a playback layer end so; what a rank takes beside three bytes of its own.
+const RANKS: &str = ".ranks";
+const OF_RANK: u64 = 8;
+
 /// Bytes for `count` Gaussians: twice as floats, since arrays are copied and grow by doubling, and once as the GPU reads them.
 fn of_gaussians(count: u64, sh_degree: usize) -> u64 {
     let rest = 3 * sh_rest_len(sh_degree) as u64;
@@ -27,8 +31,10 @@ fn of_gaussians(count: u64, sh_degree: usize) -> u64 {
 fn of_archive(archive: &Archive) -> u64 {
     let (manifest, streams) = (archive.manifest(), archive.stream_sizes());
     let decoded = |kind: StreamKind| streams.iter().filter(|s| s.kind == kind).fold(0, |sum: u64, s| sum.saturating_add(s.decoded_bytes));
-    // A layer is there as streams, as tracks and as the arrays of the scene.
-    let layer = decoded(StreamKind::Playback).saturating_mul(3);
+    // A layer is there as streams, as tracks and as the arrays of the scene. A rank, one byte of a stream, is a sum of four bytes in the tracks and in the
+    // scene.
+    let ranks = streams.iter().filter(|s| s.kind == StreamKind::Playback && s.name.ends_with(RANKS)).fold(0, |sum: u64, s| sum.saturating_add(s.decoded_bytes));
+    let layer = decoded(StreamKind::Playback).saturating_mul(3).saturating_add(ranks.saturating_mul(OF_RANK));
     of_gaussians(manifest.gaussian_count, manifest.sh_degree).saturating_add(decoded(StreamKind::Canonical)).saturating_add(layer)
 }
 
@@ -91,8 +97,10 @@ pub(crate) fn check_file(object: &str, bytes: &[u8]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_format::archive::{ArchiveWriter, Manifest};
+    use cc4dgs_format::playback::{CodedTrack, Head, PlaybackLayer};
     use cc4dgs_format::spz::{SpzOptions, to_spz};
-    use cc4dgs_format::{HostGaussians, ply};
+    use cc4dgs_format::{HostGaussians, Limits, ply};
 
     /// `count` Gaussians of degree `sh_degree`, all alike.
     fn sample(count: usize, sh_degree: usize) -> HostGaussians {
@@ -123,6 +131,21 @@ mod tests {
                 assert!((least..2 * least).contains(&estimate), "degree {degree}: {estimate} for {least}");
             }
         }
+    }
+
+    #[test]
+    fn estimates_of_layers_cover_the_sums_of_their_ranks() {
+        // The last of a thousand Gaussians uses a function, at a single time.
+        let ranks: Vec<u8> = (0..1000).map(|row| u8::from(row == 999)).collect();
+        let track =
+            CodedTrack { head: Head::Opacities, peaks: vec![1.0], functions: vec![1], ranks, step: 1.0, exponents: vec![0; 1000], coefficients: vec![1] };
+        let rows: Vec<usize> = (0..1000).collect();
+        let streams = PlaybackLayer::encode(&rows, 0, 1, &[(0, vec![track])]).unwrap();
+        let stored: u64 = streams.iter().map(|stream| stream.bytes.len() as u64).sum();
+        let writer = ArchiveWriter::new(Manifest { frame_count: 1, ..Default::default() }).add_all(StreamKind::Playback, streams);
+        let archive = Archive::from_bytes("t", writer.to_bytes().unwrap(), &Limits::default()).unwrap();
+        // Ranks have 1000 bytes, and their sums four times as many in the track and again in the scene.
+        assert_eq!(of_archive(&archive), 3 * stored + 8 * 1000);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! A model in the form that the GPU reads.
 
 use cc4dgs_format::gaussians::{sh_rest_len, unit_quaternion};
-use cc4dgs_format::playback::{Head, PlaybackLayer};
+use cc4dgs_format::playback::{Head, PlaybackLayer, Track};
 use cc4dgs_format::{BLUR, Error, HostGaussians, Result, Rules};
 
 /// Floats of a Gaussian in [`Scene::gaussians`].
@@ -125,20 +125,25 @@ impl Scene {
         (3 * sh_rest_len(self.drawn_degree)).div_ceil(2)
     }
     fn set_layer(&mut self, mut layer: PlaybackLayer) -> Result<()> {
+        let total = |of: fn(&Track) -> usize| layer.segments.iter().flat_map(|segment| &segment.tracks).map(of).sum::<usize>();
+        let (starts, coefficients) = (total(|track| track.starts.len()), total(|track| track.coefficients.len()));
+        let (largest, most) = (starts.max(coefficients) as u64, u64::from(u32::MAX));
+        if largest > most {
+            return Err(Error::limit("playback layer", largest, most, "Bake with a larger --max-error"));
+        }
+        self.starts.reserve_exact(starts);
+        self.coefficients.reserve_exact(coefficients);
         for segment in &mut layer.segments {
             let mut tracks = [None; 5];
             for track in &mut segment.tracks {
                 let at = Head::ALL.iter().position(|h| *h == track.head).unwrap_or(0);
                 tracks[at] = Some((self.starts.len() as u32, self.coefficients.len() as u32));
-                self.starts.append(&mut track.starts);
-                self.coefficients.append(&mut track.coefficients);
+                // Taken, because an emptied array would keep its memory for as long as the scene is shown.
+                self.starts.append(&mut std::mem::take(&mut track.starts));
+                self.coefficients.append(&mut std::mem::take(&mut track.coefficients));
                 track.ranks = Vec::new();
             }
             self.tracks.push(tracks);
-        }
-        let most = u64::from(u32::MAX);
-        if self.coefficients.len().max(self.starts.len()) as u64 > most {
-            return Err(Error::limit("playback layer", self.coefficients.len() as u64, most, "Bake with a larger --max-error"));
         }
         self.layer = Some(layer);
         Ok(())
@@ -212,7 +217,7 @@ fn reach(means: &[f32], still: [[f32; 3]; 2], layer: &PlaybackLayer) -> [[f32; 3
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use cc4dgs_format::playback::{Segment, Track};
+    use cc4dgs_format::playback::Segment;
 
     /// Three Gaussians whose harmonics count from 0.
     pub(crate) fn three(sh_degree: usize) -> HostGaussians {
@@ -248,6 +253,9 @@ pub(crate) mod tests {
         assert_eq!((scene.moving, xs), (2, vec![3.0, 9.0, 0.0, 6.0]));
         assert_eq!((scene.gaussians[3], scene.gaussians[8], &scene.starts), (0.5, 1.0, &vec![0, 1, 3]));
         assert_eq!(scene.tracks[0][0], Some((0, 0)));
+        // The layer keeps the functions; the memory of its other arrays is given back.
+        let kept = &scene.layer.as_ref().unwrap().segments[0].tracks[0];
+        assert_eq!((kept.functions.len(), kept.ranks.capacity(), kept.starts.capacity(), kept.coefficients.capacity()), (4, 0, 0, 0));
         assert_eq!(scene.bounds, [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]);
         // Two functions of 0 to 1 with coefficients of 1.
         assert_eq!(scene.reach, [[0.0, 1.0, 2.0], [11.0, 12.0, 13.0]]);

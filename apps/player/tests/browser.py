@@ -216,6 +216,8 @@ def webgl(pages, facts):
     page = pages.open(f"?src={MODEL}&backend=webgl")
     assert page.evaluate("!!cc4dgs.gl && cc4dgs.facts.gaussians") == facts["gaussians"]
     pages.agree(page, "WebGL2")
+    kept = page.evaluate("[0, 1].map(k => cc4dgs.gpu.plainFloats(k).length + cc4dgs.gpu.plainWords(k).length)")
+    assert kept == [0, 0], f"arrays that WebGL2 has stay in the memory of WebAssembly, too: {kept} numbers"
     page.evaluate("cc4dgs.play()")
     page.wait_for_function("cc4dgs.time > 0")
     page.evaluate("cc4dgs.pause()")
@@ -226,7 +228,9 @@ def webgl(pages, facts):
         e.loseContext(); setTimeout(() => e.restoreContext(), 200); }""")
     page.evaluate("recovered")
     pages.agree(page, "WebGL2 after a lost context")
-    page.evaluate("window.recovered = new Promise(r => cc4dgs.on('recovered', r)); window.losing = cc4dgs.gl.gl.getExtension('WEBGL_lose_context'); losing.loseContext()")
+    page.evaluate("window.recovered = new Promise(r => cc4dgs.on('recovered', r)); window.losing = cc4dgs.gl.gl.getExtension('WEBGL_lose_context'); 0")
+    captured = page.evaluate("(losing.loseContext(), cc4dgs.capture().then(() => 'it is drawn', e => e.message))")
+    assert "no graphics device" in captured, f"an image of a lost context: {captured}"
     page.wait_for_function("document.querySelector('[role=alert]')?.innerText.includes('not given WebGL2 back')")
     page.evaluate("losing.restoreContext(); recovered")
     assert page.locator("[role=alert]").count() == 0 or page.locator(".note").is_hidden(), "the message stays after the context was restored"

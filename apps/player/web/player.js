@@ -387,9 +387,15 @@ class Page {
     // Images and links
     async capture(camera, time) {
         if (this.destroyed) throw gone();
-        if (!this.gpu) throw new Error("There is no graphics device to draw an image with. Wait for \"recovered\", or reload the page.");
+        const none = () => new Error("There is no graphics device to draw an image with. Wait for \"recovered\", or reload the page.");
+        if (!this.gpu || this.gl?.lost) throw none();
         const json = camera ? JSON.stringify(camera) : undefined;
-        if (this.gl) return this.gl.capture(this.gpu, json, time);
+        if (this.gl) {
+            const image = this.gl.capture(this.gpu, json, time);
+            // A context that was lost meanwhile reports no error: the pixels are zeros.
+            if (this.gl.lost) throw none();
+            return image;
+        }
         const image = await this.gpu.capture(json, time);
         const out = { width: image.width, height: image.height, data: image.rgba };
         image.free();

@@ -365,6 +365,7 @@ export class WebGl {
         for (let y = 0; y < height; y++) data.set(raw.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
         gl.deleteFramebuffer(buffer);
         gl.deleteTexture(texture);
+        this.check(`an image of ${width}x${height} pixels`);
         return { width, height, data };
     }
 }

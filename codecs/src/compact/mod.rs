@@ -181,7 +181,7 @@ inventory::submit! {
             summary: "the smallest files: values that show less are rounded more, colours are decorrelated, all is entropy coded",
             paper: "rate-distortion allocation, Karhunen-Loève transform, asymmetric numeral systems (constriction)",
             schema: settings::SCHEMA,
-            capabilities: &["lossy", "reorders"],
+            capabilities: &["lossy", "reorders", "views"],
         },
         build,
     }

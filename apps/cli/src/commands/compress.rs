@@ -2,11 +2,15 @@
 
 use super::{Context, create_parent, megabytes};
 use crate::args::{COMPRESS_CODEC, COMPRESS_WEIGHTS, Compress};
+use crate::ignored::{Stated, refuse_ignored};
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, Presentation, StreamInfo, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Error, Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
+use cc4dgs_core::{
+    CodecPlugin, Error, Event, EventSink, Plugin, PluginEntry, Registry, Result, TuneModel, WeightCodecPlugin, config, read_gaussians, read_weights,
+};
+use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_play::{ArchiveOptions, Model, OrbitViews, ViewSource};
@@ -87,11 +91,16 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
         return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset that the model was trained on"));
     }
     config::set_all(&mut settings, &codec_sets)?;
-    // Unknown names and settings, and what needs a scene, are refused before anything is read.
+    // Unknown names and settings, what needs a scene, and options without effect are refused before anything is read.
     ArchiveOptions::check(&args.codec, &settings, &args.field_weights, args.scene.is_some(), &context.registry)?;
+    // Runs and archives state their background; where there is no model, loading it says so.
+    let has_background = matches!(Source::find(&args.model), Ok(Some(source)) if matches!(source.kind, SourceKind::Checkpoint | SourceKind::Archive));
+    refuse_unused_views(&context.registry, args, true, !has_background)?;
     let events = context.listeners(None)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     say_what_is_lost(context, &args.model, &events)?;
+    let has_weights = loaded.model.field.as_ref().is_some_and(|of| !of.field.is_static());
+    refuse_unused_views(&context.registry, args, has_weights, loaded.model.background.is_none())?;
     let scene =
         args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &scene_sets, &context.registry, &context.limits)).transpose()?.map(Arc::new);
     // A PLY says nothing of what is behind it.
@@ -124,6 +133,35 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
         events.emit(&Event::Note { object: report.archive.display().to_string(), message });
     }
     context.output.result(&report, || text(&report))
+}
+
+/// Refuses --scene and --orbit where neither the codec nor the weight codec makes use of views. `has_weights` says whether the model has weights of a deformer,
+/// `takes_background` whether it gets the background of the scene, which is of use with any codec.
+fn refuse_unused_views(registry: &Registry, args: &Compress, has_weights: bool, takes_background: bool) -> Result<()> {
+    let codec = args.codec.split(':').next().unwrap_or_default();
+    let weights = FieldWeights::parse(&args.field_weights, registry)?;
+    let of_weights = has_weights && (weights.max_drop_db.is_some() || uses_views(&registry.weight_codec(&weights.name)?.info));
+    let used = of_weights || uses_views(&registry.codec(codec)?.info);
+    let names = |kind: &str| {
+        let users = registry.plugins().into_iter().filter(|(of, info)| *of == kind && uses_views(info));
+        users.map(|(_, info)| info.name).collect::<Vec<_>>().join(", ")
+    };
+    let (beside, weight_codecs) = match has_weights {
+        true => (format!("beside the weight codec {}", args.field_weights), format!(", --field-weights {}", names(WeightCodecPlugin::KIND))),
+        false => ("of a model without a deformer".to_string(), String::new()),
+    };
+    let subject = format!("the codec {} {beside}", args.codec);
+    let remedy = format!("Leave it out, or choose what makes use of views: --codec {}{weight_codecs}", names(CodecPlugin::KIND));
+    let options = [
+        ("--scene", args.scene.as_ref().map(|scene| scene.display().to_string()), used || takes_background),
+        ("--orbit", args.orbit.map(|count| count.to_string()), used),
+    ];
+    refuse_ignored(&subject, options.map(|(option, value, used)| Stated { option, value, used, remedy: remedy.clone() }))
+}
+
+/// Whether a codec or a weight codec makes use of views, which it says by its capabilities.
+fn uses_views(info: &Plugin) -> bool {
+    ["views", "importance"].iter().any(|capability| info.capabilities.contains(capability))
 }
 
 /// What makes a smaller file where no codec was chosen; `deforms` says whether there are weights of a deformer.
@@ -203,7 +241,39 @@ pub fn stream_line(stream: &StreamSize) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::args::{Cli, Command};
     use cc4dgs_core::Recorder;
+    use clap::Parser;
+
+    /// What `compress` says of the views in `line`.
+    fn refused(line: &str, has_weights: bool, takes_background: bool) -> Option<String> {
+        let cli = Cli::try_parse_from(format!("cc4dgs compress model --out a.cc4d {line}").split_whitespace()).unwrap();
+        let Command::Compress(args) = &cli.command else { panic!("{line}") };
+        refuse_unused_views(&Registry::collect().unwrap(), args, has_weights, takes_background).err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn views_that_nothing_measures_in_are_refused() {
+        let message = refused("--orbit 16 --codec raw", true, true).unwrap();
+        let expected = "--orbit 16: it has no effect on the codec raw beside the weight codec fp32. \
+             Leave it out, or choose what makes use of views: --codec compact, --field-weights compact";
+        assert_eq!(message, expected);
+        let message = refused("--scene a --field-weights compact", false, false).unwrap();
+        let expected = "--scene a: it has no effect on the codec cca:default of a model without a deformer. \
+             Leave it out, or choose what makes use of views: --codec compact";
+        assert_eq!(message, expected);
+        assert!(refused("--scene a --codec quantize:high --field-weights int8", true, false).is_some());
+        for (line, has_weights, takes_background) in [
+            ("--codec raw", true, false),
+            ("--scene a --codec raw", false, true),
+            ("--scene a --codec compact", false, false),
+            ("--orbit 16 --codec compact:psnr=45dB", false, false),
+            ("--orbit 16 --codec raw --field-weights compact:bits=6", true, false),
+            ("--scene a --field-weights compact:max-drop=0.01dB", true, false),
+        ] {
+            assert_eq!(refused(line, has_weights, takes_background), None, "{line}");
+        }
+    }
 
     #[test]
     fn who_chose_no_codec_is_told_what_makes_files_smaller() {

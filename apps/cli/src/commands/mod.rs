@@ -6,6 +6,9 @@ mod compress;
 mod decompress;
 mod demo;
 mod doctor;
+// Needs no window, so it is tested without one.
+#[cfg(any(feature = "view", test))]
+mod ending;
 mod eval;
 // Needs no window, so it is tested without one.
 #[cfg(any(feature = "view", test))]

@@ -1,5 +1,6 @@
 //! `cc4dgs train --view`: a window that shows the model while it trains.
 
+use super::ending::{ended, panicked};
 use super::{Context, train};
 use crate::args::Train;
 use crate::interrupt;
@@ -75,19 +76,15 @@ pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> 
     let title = args.out.file_name().map_or_else(|| args.out.display().to_string(), |name| name.to_string_lossy().into_owned());
     std::thread::scope(|scope| {
         let training = scope.spawn(|| {
-            let result = with_context(&mut |context| train::run(context, args, Some(&watcher)));
-            match &result {
-                Ok(()) => watcher.live.end("The training is done.".to_string()),
-                Err(e) => watcher.live.end(format!("The training has failed: {e}")),
-            }
-            result
+            let work = || with_context(&mut |context| train::run(context, args, Some(&watcher)));
+            ended(work, |line| watcher.live.end(line))
         });
         let shown = show(&title, Shown::Training(live));
         if shown.as_ref().is_err_and(|e| !matches!(e, Error::Backend { .. })) {
             // A training that cannot be watched was not asked for; it leaves a checkpoint. One whose window lost its device goes on.
             stop.store(true, Ordering::Relaxed);
         }
-        let trained = training.join().unwrap_or_else(|_| Err(Error::backend("training", "it panicked", "Report this with what it printed")));
+        let trained = training.join().unwrap_or_else(|_| Err(panicked()));
         match (shown, trained) {
             // The training went on without its window, and is what counts.
             (Err(lost @ Error::Backend { .. }), trained) => {

@@ -46,7 +46,7 @@ enum Output {
         lost: Arc<AtomicBool>,
         failure: Arc<Mutex<Option<String>>>,
     },
-    /// The page draws with WebGL2 from the arrays of `scene`, none of which may have more than `most_words` numbers.
+    /// The page draws with WebGL2 from the arrays of `scene`, none of which may have more than `most_words` numbers, and which are empty once it has them.
     Plain { scene: Option<Scene>, most_words: u64 },
 }
 

@@ -11,17 +11,21 @@ impl Player {
     fn plain_scene(&self) -> Option<&Scene> {
         if let Output::Plain { scene, .. } = &self.output { scene.as_ref() } else { None }
     }
-    /// For WebGL2: the Gaussians (0) or the coefficients (1).
-    #[wasm_bindgen(js_name = plainFloats)]
-    pub fn plain_floats(&self, which: usize) -> Vec<f32> {
-        self.plain_scene().map_or_else(Vec::new, |s| if which == 0 { s.gaussians.clone() } else { s.coefficients.clone() })
+    fn plain_scene_mut(&mut self) -> Option<&mut Scene> {
+        if let Output::Plain { scene, .. } = &mut self.output { scene.as_mut() } else { None }
     }
-    /// For WebGL2: the harmonics (0), the starts (1), or per segment where starts and coefficients of the centres begin (2; all ones where centres do not move).
+    /// For WebGL2: the Gaussians (0) or the coefficients (1). They are handed over: the next call returns none.
+    #[wasm_bindgen(js_name = plainFloats)]
+    pub fn plain_floats(&mut self, which: usize) -> Vec<f32> {
+        self.plain_scene_mut().map_or_else(Vec::new, |s| std::mem::take(if which == 0 { &mut s.gaussians } else { &mut s.coefficients }))
+    }
+    /// For WebGL2: the harmonics (0) or the starts (1), which are handed over, too; or per segment where starts and coefficients of the centres begin (2; all
+    /// ones where centres do not move).
     #[wasm_bindgen(js_name = plainWords)]
-    pub fn plain_words(&self, which: usize) -> Vec<u32> {
-        self.plain_scene().map_or_else(Vec::new, |s| match which {
-            0 => s.harmonics.clone(),
-            1 => s.starts.clone(),
+    pub fn plain_words(&mut self, which: usize) -> Vec<u32> {
+        self.plain_scene_mut().map_or_else(Vec::new, |s| match which {
+            0 => std::mem::take(&mut s.harmonics),
+            1 => std::mem::take(&mut s.starts),
             _ => s.tracks.iter().flat_map(|tracks| tracks[Head::Means as usize].map_or([u32::MAX; 2], <[u32; 2]>::from)).collect(),
         })
     }

@@ -128,6 +128,8 @@ struct Window {
     flying: bool,
     settings: bool,
     image: Option<Image>,
+    /// The view that `image` has; `None` where it has none of this scene.
+    painted: Option<View>,
     /// Size of the player's last image in pixels.
     drawn: (u32, u32),
     visible: Arc<AtomicU32>,
@@ -172,6 +174,7 @@ impl Window {
             flying: false,
             settings: false,
             image: None,
+            painted: None,
             drawn: (1, 1),
             visible: Arc::default(),
             counted: 0.0,
@@ -203,6 +206,7 @@ impl Window {
         let Content { scene, presentation, frame_count, lacks_motion: _, remarks, bytes } = content;
         let ([lower, upper], seconds) = (scene.bounds, presentation.seconds_of(frame_count));
         self.renderer.load(scene)?;
+        self.painted = None;
         if !self.loaded {
             self.navigator = Navigator::new(&presentation, lower, upper);
             self.clock = Clock::new(frame_count, seconds);
@@ -261,7 +265,11 @@ impl Window {
         });
         let id = exact.unwrap_or_else(|| {
             let image = Image::sized(&mut self.image, state, size);
-            self.renderer.draw(&view, &image.view);
+            // The window repaints at every move of the pointer, and the scene is by far the largest part of that: it is drawn where it changed.
+            if self.painted.as_ref() != Some(&view) {
+                self.renderer.draw(&view, &image.view);
+                self.painted = Some(view.clone());
+            }
             image.id
         });
         // No stop of the Tab key: what has its focus takes the keys.
