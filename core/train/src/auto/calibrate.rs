@@ -46,7 +46,7 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     trial.density = toml::Table::from_iter([("kind".into(), "none".into())]);
     trial.train.iterations = 2 * ITERATIONS;
     (trial.train.batch, trial.train.coarse_batch) = (1, 0);
-    trial.train.shares = [1.0, 0.0, 1.0];
+    (trial.train.shares, trial.train.stretch) = ([1.0, 0.0, 1.0], 1.0);
     trial.train.dynamic = Dynamic::All;
     (trial.train.lambda_r, trial.train.recover) = (0.0, false);
     // Small images would make the first stage, where nothing moves, cheaper than what it stands for.

@@ -141,7 +141,7 @@ pub(super) fn image_size(native: &[[u32; 2]], options: &SceneOptions, machine: M
     let narrower = native.iter().filter(|size| f64::from(size[0]) < width).count();
     let have = plural(narrower, "has", "have");
     let kept = if narrower > 0 { format!("; {narrower} of {} cameras {have} smaller ones, which are not enlarged", native.len()) } else { String::new() };
-    let time = format!("{minutes:.0} {}", plural(minutes.round(), "minute", "minutes"));
+    let time = format!("{minutes} {}", plural(minutes, "minute", "minutes"));
     let reason = format!("images of {}x{} pixels are too many for {time} on this machine{kept}", median[0], median[1]);
     Some(choice([("scene.width", integer(width))], reason))
 }

@@ -187,10 +187,10 @@ pub fn open_shared(
         let patience = Duration::from_secs_f64(DECODING_SHARE * 60.0 * minutes);
         let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &Arc::new(seen(&scene)?), registry, patience, stop)?;
         let config = layers.over(&plan.table).config()?;
-        let spent = began.elapsed().as_secs_f64() / 60.0;
-        let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
+        let before = began.elapsed().as_secs_f64() / 60.0 + timing.start / 60_000.0;
+        let left = (PLANNED_SHARE * minutes - before).max(LEAST_SHARE * minutes);
         ends = (!layers.state("train.stretch")).then(|| Instant::now() + Duration::from_secs_f64(60.0 * left + timing.start / 1000.0));
-        for choice in lengths(&facts, &config, timing, minutes, left, layers.state("train.batch").then_some(config.train.batch)) {
+        for choice in lengths(&facts, &config, timing, minutes, [before, left], layers.state("train.batch").then_some(config.train.batch)) {
             plan.add(choice)?;
         }
     } else {
@@ -244,9 +244,11 @@ fn for_density_of(layers: &Layers, asked: &RunConfig, mut choice: Choice, regist
     Ok(choice)
 }
 
-/// How many views share a pass through the field, and the iterations for which the plan has `left` some of its `minutes`. `batch` is the number that the user stated;
-/// of more than the scene has, training draws all.
-fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left: f64, batch: Option<usize>) -> Vec<Choice> {
+/// How many views share a pass through the field, and the iterations for which the plan has `left` some of its `minutes`; what comes `before` them takes
+/// others.
+/// `batch` is the number that the user stated; of more than the scene has, training draws all. A stated `train.stretch` makes the main stage longer or shorter
+/// than its share of the iterations.
+fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, [before, left]: [f64; 2], batch: Option<usize>) -> Vec<Choice> {
     let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
     let main = config.train.shares[2] / total;
     let scored = config.train.dynamic != Dynamic::All;
@@ -254,8 +256,12 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
     let none = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
     let moving = if none { 0.0 } else { moving };
     let (field, view) = (moving * timing.shared, timing.still + moving * timing.per_time);
-    let ms = |views: f64| (1.0 - main) * EARLY * timing.still + main * (field + views * view);
-    let fit = |views: f64| left * 60_000.0 / ms(views);
+    let ms = |main: f64, views: f64| (1.0 - main) * EARLY * timing.still + main * (field + views * view);
+    // Stages share the iterations that are planned; of the main one, `stretch` times as many are run.
+    let stretch = config.train.stretch;
+    let longer = 1.0 + main * (stretch - 1.0);
+    let each = |views: f64| ms(stretch * main / longer, views);
+    let fit = |views: f64| left * 60_000.0 / (longer * each(views));
     let shared = (field / (FIELD_VIEWS * view)).round().clamp(1.0, MOST_VIEWS);
     let noisy = facts.arrangement == Arrangement::OneCameraAnywhere && moving > 0.0;
     let steady = (1..=STEADY_VIEWS).rev().map(|views| views as f64).find(|&views| noisy && fit(views) >= STEADY).unwrap_or(1.0);
@@ -272,11 +278,20 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
         _ if batch.is_none() && views > shared => format!("; up to {STEADY_VIEWS} make steadier steps, as many as leave {STEADY:.0} iterations"),
         _ => String::new(),
     };
+    let needed = before + count * longer * each(views) / 60_000.0;
+    let late = match needed > minutes {
+        true => format!("; these and the {before:.1} minutes before them take about {needed:.1} minutes, not {minutes}"),
+        false => String::new(),
+    };
     let mut choices = vec![
         Choice { settings: rates.to_vec(), reason: format!("what views share of the deformer takes {field:.0} ms, a view {view:.0} ms{note}") },
         Choice {
             settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
-            reason: format!("{left:.1} of {minutes} {} at about {:.0} ms per iteration on this machine", plural(minutes, "minute", "minutes"), ms(views)),
+            reason: format!(
+                "{left:.1} of {minutes} {} at about {:.0} ms per iteration on this machine{late}",
+                plural(minutes, "minute", "minutes"),
+                each(views)
+            ),
         },
     ];
     if count >= COOLED {
@@ -295,87 +310,4 @@ fn native_sizes(scene: &Scene) -> Vec<[u32; 2]> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_is_stated_is_not_in_the_plan() {
-        let registry = Registry::collect().unwrap();
-        let layers = Layers::collect(&registry, Some(PRESET), None, &["train.batch=3".into()]).unwrap();
-        let mut plan = Plan::default();
-        plan.add(Choice { settings: vec![("train.batch", 1.into()), ("train.zeta", 2.5.into())], reason: "because".into() }).unwrap();
-        assert_eq!(plan.lines(&layers), ["train.zeta = 2.5 (because)"]);
-        let config = layers.over(&plan.table).config().unwrap();
-        assert_eq!((config.train.batch, config.train.zeta), (3, 2.5));
-    }
-
-    /// Views per iteration and iterations where `left` minutes are left, with the times that `cdf` took on the capture `turntable`.
-    fn planned(left: f64, batch: Option<usize>) -> (i64, i64) {
-        planned_for(Arrangement::OneCameraAnywhere, 100, 193.0, left, batch)
-    }
-
-    /// As [`planned`], of so many training `views` that share `shared` ms.
-    fn planned_for(arrangement: Arrangement, views: usize, shared: f64, left: f64, batch: Option<usize>) -> (i64, i64) {
-        let registry = Registry::collect().unwrap();
-        let mut config = Layers::collect(&registry, Some(PRESET), None, &[]).unwrap().config().unwrap();
-        (config.train.shares, config.train.dynamic) = ([2.0, 0.0, 18.0], Dynamic::All);
-        let facts = Facts {
-            arrangement,
-            views,
-            cameras: 64,
-            frames: 120,
-            size: [192, 192],
-            points: 0,
-            transparent: 0.0,
-            plain: None,
-            mean: None,
-            detail: 0.11,
-            moving: None,
-            occupied: None,
-            noise: None,
-            exposure: None,
-            overlap: None,
-        };
-        let timing = Timing { still: 4.0, shared, per_time: 59.0, start: 0.0 };
-        let choices = lengths(&facts, &config, timing, 3.0, left, batch);
-        let value = |key: &str| choices.iter().flat_map(|c| &c.settings).find(|(k, _)| *k == key).and_then(|(_, value)| value.as_integer()).unwrap();
-        (value("train.batch"), value("train.iterations"))
-    }
-
-    #[test]
-    fn an_iteration_has_fewer_views_where_too_few_iterations_fit() {
-        assert_eq!(planned(12.0, None), (6, 1400), "what fits is left as it is");
-        assert_eq!((planned(2.4, None), planned(1.45, None)), ((2, 501), (1, 377)));
-        assert_eq!(planned(0.5, None), (1, LEAST_ITERATIONS as i64));
-        assert_eq!(planned(2.4, Some(6)), (6, 280), "stated views are left as they are");
-    }
-
-    #[test]
-    fn an_iteration_is_planned_with_no_more_views_than_there_are() {
-        let of = |views, batch| planned_for(Arrangement::OneCameraAnywhere, views, 193.0, 12.0, batch);
-        assert_eq!(of(3, Some(64)), of(100, Some(3)), "training draws three");
-        assert_eq!(of(3, None), of(100, Some(3)));
-        assert_eq!((of(1, None).0, of(1, Some(4)).0), (1, 1));
-    }
-
-    #[test]
-    fn iterations_have_several_views_where_one_camera_at_a_time_sees_everything_move() {
-        let views = |arrangement, left| planned_for(arrangement, 100, 10.0, left, None).0;
-        let found = [2.0, 3.2, 4.5, 6.0, 9.0].map(|left| views(Arrangement::OneCameraAnywhere, left));
-        assert_eq!(found, [1, 2, 3, 4, 4], "as many as leave 1,500 iterations");
-        assert_eq!(views(Arrangement::OneMovingCamera, 9.0), 1);
-    }
-
-    #[test]
-    fn few_iterations_have_a_remedy_that_helps() {
-        assert!(few(600, false).is_some_and(|line| line.starts_with("600 iterations are few") && line.contains("--minutes")));
-        assert!(few(600, true).is_some_and(|line| line.contains("train.iterations") && !line.contains("--minutes")));
-        assert_eq!((few(2000, false), few(2000, true)), (None, None));
-    }
-
-    #[test]
-    fn times_are_checked() {
-        let with = |minutes| AutoConfig { minutes: Some(minutes), ..Default::default() }.validate();
-        assert!(with(3.0).is_ok() && with(0.0).is_err() && with(f64::NAN).is_err() && with(1e9).is_err());
-    }
-}
+mod tests;

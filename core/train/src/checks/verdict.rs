@@ -37,7 +37,8 @@ pub struct Verdict {
     pub sentence: String,
     /// PSNR of at most 24 training views.
     pub train_psnr_db: f64,
-    /// PSNR of the views that `train.validation` kept out of training; where it is 0, of at most 24 views that the reader has for validation.
+    /// PSNR of at most as many views as `train.validation` states, of those that it kept out of training; where it is 0, of at most 24 views that the reader
+    /// has for validation.
     pub validation_psnr_db: Option<f64>,
     /// PSNR of the moving pixels of training views of fixed cameras.
     pub moving_psnr_db: Option<f64>,

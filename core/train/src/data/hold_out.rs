@@ -22,7 +22,7 @@ pub fn hold_out(scene: &Scene, count: usize) -> Result<Scene> {
         return Ok(rest);
     }
     let mut train = scene.split(Split::Train);
-    if count + 2 > train.len() {
+    if count.saturating_add(2) > train.len() {
         return Err(Error::parameter(
             "train.validation",
             format!("{count} of {} training views cannot be spared", train.len()),
@@ -80,6 +80,8 @@ mod tests {
             assert!(of.iter().sum::<usize>() == count && of.iter().all(|n| *n >= count / cameras), "{of:?}");
         }
         assert!(hold_out(&scene(20, 1), 0).unwrap().split(Split::Validation).is_empty());
-        assert!(hold_out(&scene(5, 1), 4).err().unwrap().to_string().contains("at most 3"));
+        for count in [4, usize::MAX] {
+            assert!(hold_out(&scene(5, 1), count).err().unwrap().to_string().contains("at most 3"), "{count}");
+        }
     }
 }

@@ -65,8 +65,14 @@ pub struct Trained {
 /// Opens the scene at `path` in the coordinates and on the clock of a model that was trained on it: other frames or cameras of a dataset would be given their
 /// own.
 ///
-/// Errors: as [`open`]; [`Error::Parameter`] for frames before the first or after the last one of the training.
+/// Errors: as [`open`]; [`Error::Parameter`] for frames before the first or after the last one of the training, [`Error::Data`] for a model that states a
+/// stride of 0.
 pub fn open_in(path: &Path, options: &SceneOptions, trained: &Trained, registry: &Registry, limits: &Limits) -> Result<Scene> {
+    // Options are checked, but those of the model may be others, and come from a file.
+    if let Some([first, count, 0]) = trained.frames {
+        let problem = format!("it states scene.frames = [{first}, {count}, 0], and a stride is 1 or more");
+        return Err(Error::data("the configuration of the model", problem, "The file is damaged; fetch or write it again"));
+    }
     // A built-in scene shows all of its time in any number of frames.
     let samples = |frames: &[usize; 3]| procedural::name_of(path).is_some() && matches!(frames, [0, count, 1] if *count > 0);
     let trained = Trained { frames: trained.frames.filter(|frames| !samples(frames)), ..*trained };

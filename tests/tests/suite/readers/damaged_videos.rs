@@ -104,3 +104,20 @@ fn joined_recordings_are_not_mixed_up() {
     let error = problem(&opened(&dir, &options), 0).unwrap();
     assert!(error.contains("cam00.ts") && error.contains("order of their times"), "{error}");
 }
+
+#[test]
+fn streams_that_begin_between_key_frames_are_read_from_the_first_one_on() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(1, SIZE);
+    let file = dir.path().join("cam00.ts");
+    record(&file, 0, &(0..60).collect::<Vec<_>>(), "25", &["-c:v", "mpeg2video", "-g", "12", "-bf", "2"]);
+    // Transport streams have packets of 188 bytes; a third of them was not recorded.
+    let bytes = std::fs::read(&file).unwrap();
+    std::fs::write(&file, &bytes[bytes.len() / 3 / 188 * 188..]).unwrap();
+    let found = instants(&opened(&dir, &options));
+    let first = found[&0][0].unwrap();
+    assert!(first > 0 && first + found.len() == 60, "{} frames from {first} on", found.len());
+    assert_eq!(found, (0..found.len()).map(|k| (k, vec![Some(first + k)])).collect());
+}

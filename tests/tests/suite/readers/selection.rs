@@ -115,6 +115,8 @@ fn other_frames_keep_the_clock_of_a_training() {
         assert_eq!(times(Some([2, 5, 1]), Some([2, 5, 1])).unwrap(), [0.0, 0.25, 0.5, 0.75, 1.0]);
         let beyond = times(Some([2, 5, 1]), None).unwrap_err();
         assert!(beyond.exit_code() == 2 && beyond.to_string().contains("scene.frames"), "{beyond}");
+        let damaged = times(Some([0, 5, 0]), Some([0, 3, 1])).unwrap_err();
+        assert!(damaged.exit_code() == 3 && damaged.to_string().contains("[0, 5, 0]"), "{damaged}");
     }
     // The frames of a built-in scene are samples of all of its time, whatever their number.
     let (path, options) = (Path::new("procedural:tiny"), SceneOptions { frames: Some([0, 5, 1]), ..Default::default() });

@@ -108,6 +108,9 @@ fn images_shrink_to_the_time() {
     let width = large.settings[0].1.as_integer().unwrap();
     assert!((500..700).contains(&width), "{width}");
     assert_eq!(large.reason, "images of 1920x1080 pixels are too many for 10 minutes on this machine");
+    let short = [0.4, 1.0, 1.5].map(|minutes| image_size(&[[1920, 1080]], &options, MACHINE, minutes).unwrap().reason);
+    let said = ["0.4 minutes", "1 minute", "1.5 minutes"].map(|time| format!("images of 1920x1080 pixels are too many for {time} on this machine"));
+    assert_eq!(short, said);
     let mixed = image_size(&[[320, 180], [1920, 1080], [1920, 1080]], &options, MACHINE, 10.0).unwrap();
     assert_eq!(mixed.settings, large.settings);
     assert_eq!(mixed.reason, format!("{}; 1 of 3 cameras has smaller ones, which are not enlarged", large.reason));

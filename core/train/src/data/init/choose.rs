@@ -5,6 +5,7 @@ use super::super::normalise::CAMERA_DISTANCE;
 use crate::sample::spread_from_first;
 use cc4dgs_core::{Camera, Scene, Split};
 use glam::{DMat3, DVec3};
+use std::collections::BTreeSet;
 
 /// The most images that get a depth map.
 const MAX_KEYS: usize = 40;
@@ -18,7 +19,7 @@ const BEST_ANGLE_RAD: f64 = 0.25;
 const TIME_SHARE: f64 = 0.15;
 /// Training cameras at one time that need no other times.
 const ENOUGH_AT_ONE_TIME: usize = 4;
-/// The most views whose positions are compared with each other.
+/// The most cameras whose positions are compared with each other.
 const MAX_POSES: usize = 300;
 
 /// How the training cameras are arranged in space and time.
@@ -57,7 +58,7 @@ impl Choice {
         all.iter().for_each(|&v| by_frame[scene.views[v].frame].push(v));
         let most = by_frame.iter().map(Vec::len).max().unwrap_or(0);
         let size = rig.distance.unwrap_or(1.0);
-        let positions = |views: &[usize]| count_positions(scene, &spread_from_first(views, MAX_POSES), 1e-3 * size);
+        let positions = |views: &[usize]| count_positions(scene, views, 1e-3 * size);
         let wanted = most.min(ENOUGH_AT_ONE_TIME);
         let first = by_frame.into_iter().find(|v| v.len() >= wanted).unwrap_or_default();
         let at_one_time = positions(&first);
@@ -107,11 +108,14 @@ fn rig(scene: &Scene, views: &[usize]) -> Focus {
     focus(&used.iter().map(ray).collect::<Vec<_>>(), Some(CAMERA_DISTANCE))
 }
 
-/// How many camera positions differ by more than `apart`.
+/// How many positions of at most [`MAX_POSES`] cameras of `views` differ by more than `apart`.
 fn count_positions(scene: &Scene, views: &[usize], apart: f64) -> usize {
+    // Each camera once: of views by frame, every so many may be of one camera.
+    let mut known = BTreeSet::new();
+    let cameras: Vec<usize> = views.iter().map(|&v| scene.views[v].camera).filter(|&camera| known.insert(camera)).collect();
     let mut found: Vec<DVec3> = Vec::new();
-    for &v in views {
-        let center = DVec3::from(scene.camera(v).center_world());
+    for camera in spread_from_first(&cameras, MAX_POSES) {
+        let center = DVec3::from(scene.cameras[camera].center_world());
         if found.iter().all(|f| f.distance(center) > apart) {
             found.push(center);
         }
@@ -175,4 +179,27 @@ fn nearest(own: &Pose, poses: &[Pose], most: usize, skip: impl Fn(usize) -> bool
         .collect();
     found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     found.into_iter().take(most).map(|f| f.1).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::{NoImages, View};
+    use std::sync::Arc;
+
+    /// Fixed cameras side by side that look at the origin, of which frame k has an image of camera k modulo `cameras`.
+    fn in_turns(cameras: usize, frames: usize) -> Scene {
+        let camera = |k: usize| Camera::look_at(&format!("c{k}"), (8, 8), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let view = |frame: usize| View { camera: frame % cameras, frame, time_norm: frame as f32 / frames as f32, split: Split::Train };
+        Scene::new("s", (0..cameras).map(camera).collect(), (0..frames).map(view).collect(), Arc::new(NoImages), 0).unwrap()
+    }
+
+    #[test]
+    fn cameras_that_take_turns_stand_at_several_positions() {
+        // Every second or fourth of these views, which is as many as are compared, is of the first camera.
+        for (cameras, frames) in [(2, 10), (2, 2 * MAX_POSES), (4, 4 * MAX_POSES)] {
+            assert_eq!(Choice::new(&in_turns(cameras, frames)).arrangement, Arrangement::AcrossTimes, "{cameras} cameras, {frames} frames");
+        }
+        assert_eq!(Choice::new(&in_turns(1, 2 * MAX_POSES)).arrangement, Arrangement::OnePose);
+    }
 }

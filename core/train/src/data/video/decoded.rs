@@ -56,10 +56,10 @@ impl Decoded {
             && self.times.len() < expected.len()
         {
             let problem = format!("its frames change their size or pixel format at {time:.3} s (frame {})", self.times.len());
-            return Err(refused(video, problem, Some(facts.size)));
+            return Err(refused(video, problem, self.times.len(), Some(facts.size)));
         }
         let compared = &self.times[..self.times.len().min(expected.len())];
-        let (problem, may_be_right) = if facts.is_timed {
+        let (problem, sound, may_be_right) = if facts.is_timed {
             let found = self.matched(expected);
             let wrong = expected.iter().zip(found).enumerate().find_map(|(frame, (time, image))| (image != Some(frame)).then_some((frame, *time)));
             let Some((frame, time)) = wrong else { return Ok(()) };
@@ -69,21 +69,21 @@ impl Decoded {
                 (true, true) => format!("from frame {frame} on, at {time:.3} s, its frames are out of the order of their times, or fewer than its packets"),
                 (false, _) => format!("from frame {frame} on, at {time:.3} s, its frames decode at other times than its packets state"),
             };
-            (problem, !are_known && is_ascending(&self.times) && is_ascending(&facts.times))
+            (problem, frame, !are_known && is_ascending(&self.times) && is_ascending(&facts.times))
         } else {
             let is_short = compared.len() < expected.len();
             let pause = pause(compared);
             if !is_short && pause.is_none() {
                 return Ok(());
             }
-            let problem = match pause.and_then(|frame| Some((frame, compared.get(frame)?))) {
-                Some((frame, time)) => format!("what follows its frame {frame}, at {time:.3} s, does not decode: the file is damaged there"),
-                None => format!("only {} of its first {} frames decode", compared.len(), expected.len()),
+            let (problem, sound) = match pause.and_then(|frame| Some((frame, compared.get(frame)?))) {
+                Some((frame, time)) => (format!("what follows its frame {frame}, at {time:.3} s, does not decode: the file is damaged there"), frame + 1),
+                None => (format!("only {} of its first {} frames decode", compared.len(), expected.len()), compared.len()),
             };
-            (problem, !is_short)
+            (problem, sound, !is_short)
         };
         // As many images as frames, each in order: image k is frame k, whatever their clocks.
-        if may_be_right && total()? == Some(facts.times.len()) { Ok(()) } else { Err(refused(video, problem, None)) }
+        if may_be_right && total()? == Some(facts.times.len()) { Ok(()) } else { Err(refused(video, problem, sound, None)) }
     }
 
     /// For each of the ascending `times` the number of the image that was decoded for it. Images are not taken back: `times` and images go forward together.
@@ -119,16 +119,18 @@ fn pause(times: &[f64]) -> Option<usize> {
     intervals.iter().position(|interval| *interval > LONGEST * usual)
 }
 
-/// The error of a video whose frames cannot be told apart, and the command that helps: `size` is the one to bring all frames to, where they have several.
-fn refused(video: &Path, problem: String, size: Option<[u32; 2]>) -> Error {
+/// The error of a video of which only the first `sound` images are known to be those of their frames, and the command that helps: `size` is the one to bring
+/// all frames to, where they have several.
+fn refused(video: &Path, problem: String, sound: usize, size: Option<[u32; 2]>) -> Error {
     let (name, stem) = (file_name(video), video.file_stem().unwrap_or_default().to_string_lossy());
     let scale = size.map_or_else(String::new, |[width, height]| format!(" -vf scale={width}:{height}"));
+    let before = if sound > 0 { ". Or choose frames before (scene.frames)" } else { "" };
     Error::data(
         format!("video {}", video.display()),
         problem,
         format!(
             "Encode it anew (ffmpeg -i {name}{scale} -c:v libx264 -crf 12 -pix_fmt yuv444p OTHER_FOLDER/{stem}.mkv) and put the new file in its place: it has no frames at the \
-             times that do not decode. Or choose frames before (scene.frames)"
+             times that do not decode{before}"
         ),
     )
 }
@@ -170,7 +172,8 @@ mod tests {
         assert_eq!(message(&[0.0, 0.04, 0.12], &video, 1, None), None, "nothing that is wanted is damaged");
         let lost = message(&[0.0, 0.04, 0.12, 0.16], &video, 3, Some(5)).unwrap();
         assert!(["a/cam03.mp4", "frame 2, at 0.080 s", "OTHER_FOLDER/cam03.mkv", "scene.frames"].iter().all(|part| lost.contains(part)), "{lost}");
-        assert!(message(&[0.04, 0.08, 0.12, 0.16], &video, 0, None).unwrap().contains("frame 0, at 0.000 s"));
+        let first = message(&[0.04, 0.08, 0.12, 0.16], &video, 0, None).unwrap();
+        assert!(first.contains("frame 0, at 0.000 s") && !first.contains("scene.frames"), "{first}");
         assert!(message(&[0.0, 0.04, 0.08, 0.12], &video, 4, None).unwrap().contains("frame 4, at 0.160 s"));
         assert!(message(&[], &video, 0, None).unwrap().contains("frame 0"));
         assert_eq!(decoded(&[0.0, 0.04, 0.12]).images(&video, 4), [Some(0), Some(1), None, Some(2)]);

@@ -16,6 +16,9 @@ const TAN_ONE_DEGREE: f64 = 0.017_455;
 /// The rate of a video that states none. It cancels out where all videos of a scene state none.
 const DEFAULT_RATE: f64 = 25.0;
 
+/// Packets among which the first key frame of a video is looked for that does not begin with one: those of ten seconds at 30 frames per second.
+const MOST_LEADING: usize = 300;
+
 /// Difference of times in seconds that is rounding.
 pub(super) const SAME_TIME: f64 = 1e-4;
 
@@ -121,7 +124,7 @@ fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFa
     limits.check_pixels(&format!("video {}", video.display()), stream.width, stream.height)?;
     let turn = stream.turn().map_err(|angle| bad(format!("it is displayed turned by {angle:.1} degrees"), "Turn it by a multiple of 90 degrees"))?;
     let size = [stream.width as u32, stream.height as u32];
-    let first = if has_leading(&printed.packets) { first_decoded(video, options)? } else { None };
+    let first = if has_leading(&printed.packets) { first_decoded(video, &printed.packets, options)? } else { None };
     let (times, keys) = frame_times(&printed.packets, stream, first);
     let is_timed = shown_from(&printed.packets, first).all(|packet| seconds(&packet.pts_time).is_some());
     if times.is_empty() {
@@ -140,9 +143,11 @@ pub(super) fn turn_of(video: &Path, options: &SceneOptions) -> Result<Turn> {
     })
 }
 
-/// When the first frame is shown that can be decoded.
-fn first_decoded(video: &Path, options: &SceneOptions) -> Result<Option<f64>> {
-    let printed = ask(video, options, &["-read_intervals", "%+#1", "-show_entries", "frame=pts_time"])?;
+/// When the first frame is shown that can be decoded. `packets` are those of the video.
+fn first_decoded(video: &Path, packets: &[Packet], options: &SceneOptions) -> Result<Option<f64>> {
+    let begins_with_key = packets.first().is_some_and(|packet| packet.flags.contains('K'));
+    let interval = format!("%+#{}", if begins_with_key { 1 } else { MOST_LEADING });
+    let printed = ask(video, options, &["-read_intervals", &interval, "-show_entries", "frame=pts_time"])?;
     Ok(printed.frames.first().and_then(|frame| seconds(&frame.pts_time)))
 }
 
