@@ -23,6 +23,7 @@ mod tests {
         let registry = Registry::collect().unwrap();
         let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(1) };
         let voxels = "resolutions = [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8]\nhidden = [4096, 4096, 4096, 4096, 4096, 4096, 4096, 4096]\nfeatures = 4096\nhashes = 4096";
+        let wide = "resolutions = [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8]\nhidden = []\nfeatures = 4096\nhashes = 1\nwidth = 4096\ntime_layers = 1\nheads = ['opacity']";
         for (kind, settings) in [
             ("cdf", voxels),
             ("cdf-basis", voxels),
@@ -34,6 +35,8 @@ mod tests {
             ("deform-mlp", "width = 4096\nlayers = 32"),
             // No network is too large by itself, but all together are.
             ("cdf", "width = 4096\ntime_layers = 12"),
+            // The layer between 16 levels of 4096 features and a network 4096 wide.
+            ("cdf", wide),
             ("cdf-basis", "resolutions = [8]\nhidden = [4096, 4096, 4096, 4096, 4096, 4096]\nfeatures = 4096\nhashes = 4096\nwidth = 4096\nlayers = 8"),
         ] {
             let mut section: toml::Table = settings.parse().unwrap();

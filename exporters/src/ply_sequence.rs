@@ -28,7 +28,10 @@ impl Exporter for PlySequence {
         let digits = (facts.times_norm.len().max(1) - 1).to_string().len().max(4);
         let mut written = Exported::default();
         for (index, time) in facts.times_norm.iter().enumerate() {
-            let gaussians = still::with_rotations(source.gaussians(Some(*time))?);
+            let gaussians = source.gaussians(Some(*time))?;
+            // Before rotations that are no numbers are taken for some that are not drawn.
+            still::check(&gaussians, "PLY")?;
+            let gaussians = still::with_rotations(gaussians);
             still::write(&path.join(format!("{}_{index:0digits$}.ply", facts.name)), &to_bytes_with(&gaussians, &options)?)?;
             written = Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: index + 1, notes: Vec::new() };
             source.progress(index + 1, facts.times_norm.len())?;

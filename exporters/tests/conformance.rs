@@ -99,6 +99,40 @@ fn spz_says_what_its_ranges_and_steps_lose() {
 }
 
 #[test]
+fn sog_says_where_its_steps_of_centres_are_coarse() {
+    let exporter = (Entries::<ExporterPlugin>::collect().unwrap().get("sog").unwrap().build)(&toml::Table::new()).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let notes = |count: usize, change: fn(&mut HostGaussians)| {
+        let mut model = conformance::MovingModel::new(count, 0).with_gaussians(change);
+        exporter.write(&mut model, &folder.path().join("model.sog")).unwrap().notes
+    };
+    // One far away widens the steps of all by the logarithm of its distance, which these Gaussians can bear.
+    assert!(notes(30, |_| {}).is_empty() && notes(30, |g| g.means[7] = 1e6).is_empty() && notes(0, |_| {}).is_empty());
+    // Small Gaussians, and centres far from the origin, where steps grow with the distance.
+    let coarse: [fn(&mut HostGaussians); 2] = [|g| g.log_scales.fill(-9.0), |g| g.means.iter_mut().for_each(|v| *v *= 1e4)];
+    for change in coarse {
+        let told = notes(30, change);
+        assert!(told.len() == 1 && told[0].starts_with("centres are in steps of ") && told[0].contains("(median), coarse beside"), "{told:?}");
+    }
+    assert!(exporter.loses(&conformance::export_facts(3, 0)).contains("all but 16 bits of positions"));
+}
+
+#[test]
+fn rotations_that_are_no_numbers_are_refused_by_both_formats_of_ply() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["ply", "ply-sequence"] {
+        let exporter = (Entries::<ExporterPlugin>::collect().unwrap().get(name).unwrap().build)(&toml::Table::new()).unwrap();
+        let path = folder.path().join(name);
+        if name == "ply-sequence" {
+            std::fs::create_dir(&path).unwrap();
+        }
+        let mut model = conformance::MovingModel::new(20, 0).with_gaussians(|g| g.quaternions[74] = f32::NAN);
+        let message = exporter.write(&mut model, &path).unwrap_err().to_string();
+        assert!(message.contains("quaternions of Gaussian 18 is NaN"), "{name}: {message}");
+    }
+}
+
+#[test]
 fn settings_out_of_range_are_refused_before_a_model_is_read() {
     let exporters = Entries::<ExporterPlugin>::collect().unwrap();
     for (name, bad) in [

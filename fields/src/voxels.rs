@@ -83,6 +83,12 @@ impl VoxelSettings {
         if resolutions.len() != levels {
             return Err(Error::parameter("deformer.resolutions", format!("{} entries for {levels} levels", resolutions.len()), "Give one per level"));
         }
+        if let (None, Some(&finest)) = (&self.resolutions, resolutions.last())
+            && finest > MAX_RESOLUTION
+        {
+            let problem = format!("{levels} levels that double from 16 cells per axis end at {finest}, over {MAX_RESOLUTION}");
+            return Err(Error::parameter("deformer.levels", problem, "Give at most 7 levels, or the cells of each level as deformer.resolutions"));
+        }
         for &r in &resolutions {
             within("resolutions", r as usize, 1, MAX_RESOLUTION as usize)?;
         }
@@ -162,5 +168,21 @@ impl Cell {
             let weight = (0..3).map(|d| if upper(d) == 1 { self.part[d] } else { 1.0 - self.part[d] }).product();
             (std::array::from_fn(|d| self.cell[d] + upper(d)), weight)
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_that_double_past_the_largest_grid_are_named() {
+        let of = |levels: usize, resolutions: Option<Vec<u32>>| VoxelSettings { levels: Some(levels), resolutions, ..Default::default() }.sizes();
+        assert_eq!(of(7, None).unwrap().resolutions.last(), Some(&1024));
+        for levels in [8, 16] {
+            let error = of(levels, None).unwrap_err().to_string();
+            assert!(error.contains("deformer.levels") && error.contains("at most 7") && error.contains("resolutions"), "{error}");
+        }
+        assert!(of(8, Some(vec![8; 8])).is_ok());
     }
 }

@@ -39,7 +39,9 @@ pub fn allocate(
     };
     // With a factor f, the error of a column is a f² and its size b - c log2 f.
     let (mut errors, mut slopes) = ([0.0; 6], [0.0; 6]);
-    for column in 0..factors.len() {
+    // Without harmonics the last column is empty.
+    let columns = if job.planner.gaussians.sh_degree == 0 { factors.len() - 1 } else { factors.len() };
+    for column in 0..columns {
         let mut changed = factors;
         changed[column] = CHANGE;
         let (more, less) = measure(&changed)?;

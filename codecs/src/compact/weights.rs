@@ -228,7 +228,8 @@ impl WeightCodec for Weights {
         Ok(Some(out))
     }
     fn loss(&self) -> f64 {
-        let least = (0..self.array_bits.len().max(1)).map(|index| self.quarter_bits(index)).min().unwrap_or(0);
+        // Arrays beyond the list have `bits`, which stands behind it.
+        let least = (0..=self.array_bits.len()).map(|index| self.quarter_bits(index)).min().unwrap_or(0);
         0.5 / Form { quarter_bits: least, largest: 1.0, shifted: false }.peak() + 1e-6
     }
 }
@@ -319,6 +320,20 @@ mod tests {
         let slopes: Vec<f32> = bit_slopes(&row, 1.0).collect();
         assert!(slopes[0] == 0.0 && (slopes[16] - 1.0).abs() < 0.05 && slopes[17] == -slopes[16], "{slopes:?}");
         assert!(bit_slopes(&[0.0; 16], 1.0).all(|slope| slope == 0.0));
+    }
+
+    #[test]
+    fn the_declared_loss_holds_for_arrays_beyond_the_list_of_bits() {
+        let codec = Weights { bits: 3.0, array_bits: vec![16.0] };
+        let context = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
+        let values: Vec<f32> = (0..64).map(|k| (k as f32 * 0.37).sin()).collect();
+        let weights = ["first", "second"].map(|name| WeightArray { name: name.into(), shape: vec![64], values: values.clone() });
+        let found = codec.decode(&codec.encode(&weights, &context).unwrap(), &context).unwrap();
+        for (before, after) in weights.iter().zip(&found) {
+            let worst = before.values.iter().zip(&after.values).map(|(a, b)| f64::from(a - b).abs()).fold(0.0, f64::max);
+            let largest = before.values.iter().fold(0.0, |most: f64, v| most.max(f64::from(*v).abs()));
+            assert!(worst <= codec.loss() * largest, "{}: {worst} of {largest}", before.name);
+        }
     }
 
     #[test]

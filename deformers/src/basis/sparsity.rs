@@ -6,6 +6,7 @@
 
 use super::Basis;
 use burn::tensor::{Tensor, TensorData};
+use cc4dgs_core::ordered_sum;
 
 /// Added to squared norms, so that a group of zeros has a derivative.
 const LEAST_SQUARED_NORM: f32 = 1e-12;
@@ -26,9 +27,9 @@ pub(super) fn group_lasso(field: &Basis, weight: f32) -> Option<Tensor<1>> {
         // The lower bound keeps the penalty finite for a box without extent.
         let weight = weight / (field.scale_of(head) as f32).max(LEAST_SCALE);
         let last = parameter.value.clone().narrow(0, hidden, (width + 1) * outputs * own).reshape([(width + 1) * outputs, own]);
-        let norms = (last.clone() * last).sum_dim(0).add_scalar(LEAST_SQUARED_NORM).sqrt().flatten(0, 1);
+        let norms = (last.clone() * last).sum_dim(0).add_scalar(LEAST_SQUARED_NORM).sqrt().flatten::<1>(0, 1);
         let price: Vec<f32> = kept.iter().map(|&f| weight * prices[f]).collect();
-        let term = (norms * Tensor::<1>::from_data(TensorData::new(price, [own]), &parameter.value.device())).sum();
+        let term = ordered_sum(norms * Tensor::<1>::from_data(TensorData::new(price, [own]), &parameter.value.device()));
         total = Some(match total {
             Some(sum) => sum + term,
             None => term,

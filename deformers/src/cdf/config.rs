@@ -184,7 +184,9 @@ impl CdfConfig {
         let heads = network.heads.iter().map(|h| vec![width, h.width(context.sh_degree)]).collect();
         let network = ReluShape { input: width, trunk: vec![width; TRUNK_LAYERS], heads };
         let of_film = film.as_ref().map_or(0, ReluShape::parameter_count);
-        bounded([voxels.parameter_count(), time.parameter_count(), of_film, network.parameter_count()])?;
-        Ok(Sizes { voxels, width, time_bands, time, film, network })
+        let sizes = Sizes { voxels, width, time_bands, time, film, network };
+        let of_spatial = (sizes.spatial_inputs() + 1).saturating_mul(width);
+        bounded([sizes.voxels.parameter_count(), of_spatial, sizes.time.parameter_count(), of_film, sizes.network.parameter_count()])?;
+        Ok(sizes)
     }
 }

@@ -25,6 +25,10 @@ iterations = 6           # of k-means for the palette
 const HIGHEST_DEGREE: usize = 3;
 /// Largest side of an image in pixels, a multiple of 4.
 const LARGEST_SIDE: usize = 16_380;
+/// Largest code of a coordinate: 16 bits.
+const LARGEST_CODE: f64 = 65_535.0;
+/// Steps of centres are coarse from this share of a Gaussian's standard deviation on.
+const COARSE: f64 = 0.1;
 
 #[derive(Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -45,7 +49,7 @@ impl Exporter for Sog {
             (facts.sh_degree > HIGHEST_DEGREE, "harmonics over degree 3"),
             (true, "background"),
             (true, "dynamic scores"),
-            (true, "all but 8 bits of what is no position (harmonics: a palette)"),
+            (true, "all but 16 bits of positions and 8 of all else (harmonics: a palette)"),
         ];
         still::sentence(facts, &parts)
     }
@@ -54,7 +58,8 @@ impl Exporter for Sog {
         let file = self.to_bytes(&gaussians, source.facts().antialiased)?;
         source.progress(2, 2)?;
         still::write(path, &file)?;
-        Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree.min(HIGHEST_DEGREE), frames: 1, notes: Vec::new() })
+        let notes = coarse_steps(&gaussians).into_iter().collect();
+        Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree.min(HIGHEST_DEGREE), frames: 1, notes })
     }
 }
 
@@ -129,17 +134,41 @@ impl Sog {
     }
 }
 
-/// Lower and upper bytes of the centres, and the extremes per axis in the logarithmic domain.
-fn positions(means: &[f32]) -> Result<(Pixels, Pixels, [f64; 3], [f64; 3])> {
+/// The centres in the logarithmic domain, and their extremes per axis.
+fn logarithmic(means: &[f32]) -> (Vec<[f64; 3]>, [f64; 3], [f64; 3]) {
     let log = |v: f32| f64::from(v).signum() * f64::from(v).abs().ln_1p();
     let points: Vec<[f64; 3]> = means.as_chunks::<3>().0.iter().map(|p| p.map(log)).collect();
     let corner =
         |pick: fn(f64, f64) -> f64| -> [f64; 3] { points.iter().copied().reduce(|a, p| std::array::from_fn(|k| pick(a[k], p[k]))).unwrap_or_default() };
     let (mins, maxs) = (corner(f64::min), corner(f64::max));
+    (points, mins, maxs)
+}
+
+/// That the steps of centres are coarse beside the Gaussians, in words, where they are: they grow with the logarithm of the extremes, and with the distance
+/// from the origin.
+fn coarse_steps(gaussians: &HostGaussians) -> Option<String> {
+    let (points, mins, maxs) = logarithmic(&gaussians.means);
+    // A step in the logarithmic domain is 1 + |x| times as long at x.
+    let step = |p: &[f64; 3]| (0..3).map(|k| (maxs[k] - mins[k]) / LARGEST_CODE * p[k].abs().exp()).fold(0.0, f64::max);
+    let mut steps: Vec<f64> = points.iter().map(step).collect();
+    let mut sizes: Vec<f64> = gaussians.log_scales.iter().map(|s| f64::from(*s).exp()).collect();
+    let [step, size] = [median(&mut steps)?, median(&mut sizes)?];
+    (step > COARSE * size).then(|| format!("centres are in steps of {step:.2e} (median), coarse beside the median standard deviation of {size:.2e}"))
+}
+
+/// The middle one of `values`, which are reordered; `None` without any.
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Lower and upper bytes of the centres, and the extremes per axis in the logarithmic domain.
+fn positions(means: &[f32]) -> Result<(Pixels, Pixels, [f64; 3], [f64; 3])> {
+    let (points, mins, maxs) = logarithmic(means);
     let code = |p: &[f64; 3]| -> [u16; 3] {
         std::array::from_fn(|k| {
             let width = maxs[k] - mins[k];
-            if width > 0.0 { ((p[k] - mins[k]) / width * 65535.0).round() as u16 } else { 0 }
+            if width > 0.0 { ((p[k] - mins[k]) / width * LARGEST_CODE).round() as u16 } else { 0 }
         })
     };
     let codes: Vec<[u16; 3]> = points.iter().map(code).collect();

@@ -42,7 +42,7 @@ impl Exporter for Splatv {
         let motion = if facts.moving > 0 { "motion is one cubic per Gaussian and opacity one bell over time, " } else { "" };
         let harmonics = if facts.sh_degree > 0 { ", colours are the same from every side" } else { "" };
         let blur = facts.lost_blur().map_or_else(String::new, |blur| format!(", {blur}"));
-        format!("In splatV {motion}rotations and scales have 11 bits{harmonics}, and background{blur} and dynamic scores are lost.")
+        format!("In splatV {motion}rotations and scales have 11 bits, colours and opacities 8{harmonics}, and background{blur} and dynamic scores are lost.")
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let facts = source.facts().clone();

@@ -101,7 +101,8 @@ fn motion(kind: SpaceKind, source: &MotionSource) -> Result<Option<ComputedMotio
 fn samples_for(functions: &TemporalFunctions) -> usize {
     let fastest = if functions.bands == 0 { 0.0 } else { f64::from(functions.cycles) * (functions.bands as f64 - 1.0).exp2() };
     let of_bands = (SAMPLES_PER_CYCLE * fastest).ceil() as usize;
-    of_bands.max(SAMPLES_PER_SPLINE * functions.splines) + 1
+    // 24 bands of 16 cycles need 2^32, which 32 bits do not hold.
+    of_bands.max(SAMPLES_PER_SPLINE * functions.splines).saturating_add(1)
 }
 
 /// Whether features or multiplications for `m` Gaussians and `samples` of time are more than a player should spend.

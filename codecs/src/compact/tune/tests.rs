@@ -239,6 +239,18 @@ fn what_the_search_has_found_is_not_made_again() {
 }
 
 #[test]
+fn no_change_of_harmonics_is_tried_where_there_are_none() {
+    with_job(0, |job, _, _, _| {
+        let camera = Camera::look_at("t", (2, 2), 1.0, [4.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
+        let view = Uneven { colors: job.planner.gaussians.sh_dc.to_vec(), camera, lost: 0.03 };
+        let whole = job.planner.gaussians.to_host();
+        CODED.set(0);
+        let factors = allocate(job, 0.01, None, &whole, &view, &view).unwrap();
+        assert_eq!((CODED.replace(0), factors[5]), (6, 1.0));
+    });
+}
+
+#[test]
 fn weights_are_not_encoded_in_steps_that_no_round_takes() {
     with_job(0, |job, _, context, _| {
         let attempt = job.attempt(0.01).unwrap().0;
