@@ -27,16 +27,21 @@ impl Clock {
         if !self.playing || self.frames < 2 || elapsed_s.is_nan() || elapsed_s <= 0.0 {
             return false;
         }
-        let next = self.time + elapsed_s * self.speed / self.seconds;
+        let before = self.time;
+        let next = before + elapsed_s * self.speed / self.seconds;
         if (0.0..=1.0).contains(&next) {
             self.time = next;
         } else if self.looping {
-            self.time = next.rem_euclid(1.0);
+            self.seek(next.rem_euclid(1.0));
         } else {
-            self.time = next.clamp(0.0, 1.0);
+            self.seek(next);
             self.playing = false;
         }
-        true
+        self.time != before
+    }
+    /// Whether ticks move time, so that further frames are worth drawing.
+    pub fn runs(&self) -> bool {
+        self.playing && self.frames > 1 && self.speed != 0.0
     }
     /// Plays or pauses. Where time stands at the end, playing begins anew.
     pub fn play(&mut self, on: bool) {
@@ -92,6 +97,13 @@ mod tests {
         assert_eq!(clock.time, 0.0);
         clock.seek(f32::NAN);
         assert_eq!(clock.time, 0.0);
+        (clock.speed, clock.looping, clock.playing) = (0.0, true, true);
+        clock.seek(0.5);
+        assert!(!clock.tick(0.1) && !clock.runs() && clock.playing && clock.time == 0.5, "at speed 0 nothing has to be drawn again");
+        clock.speed = f32::MAX;
+        clock.seconds = 1e-3;
+        clock.tick(1.0);
+        assert!((0.0..=1.0).contains(&clock.time), "{}", clock.time);
         let mut still = Clock::new(1, 2.0);
         still.step(1);
         assert_eq!((still.time, still.frame()), (0.0, 0), "a single frame has no next one");

@@ -3,14 +3,10 @@
 use crate::memory;
 use crate::scene::Scene;
 use cc4dgs_format::archive::{Archive, MAGIC, Presentation, StreamKind};
-use cc4dgs_format::{BLUR, BLUR_RANGE, Error, GaussianFile, Limits, Result, Rules, Silent, StoredModel, ply, spz};
+use cc4dgs_format::{BLUR, BLUR_RANGE, Error, GaussianFile, LEAST_NEAR, Limits, Result, Rules, Silent, StoredModel, near_without_units, ply, spz};
 
-/// Smallest near plane: depths are sorted by their logarithm.
-const LEAST_NEAR: f32 = 1e-6;
-/// Greatest.
+/// Greatest near plane.
 const MOST_NEAR: f32 = 1e6;
-/// The near plane of models without units, as a share of half their diagonal.
-const NEAR_OF_RADIUS: f32 = 0.01;
 
 /// A file's model with everything a player wants to know of it.
 pub struct Content {
@@ -53,11 +49,7 @@ impl Content {
         };
         let mut scene = Scene { antialiased: file.antialiased, ..Scene::new(&file.gaussians, None)? };
         // The file does not say its units: cameras around a small model are near it too.
-        let [lower, upper] = scene.bounds;
-        let radius = 0.5 * lower.iter().zip(upper).map(|(low, high)| (high - low).powi(2)).sum::<f32>().sqrt();
-        if radius > 0.0 && radius.is_finite() {
-            scene.near = scene.near.min(NEAR_OF_RADIUS * radius).max(LEAST_NEAR);
-        }
+        scene.near = near_without_units(scene.bounds, scene.near);
         let remarks = file.remarks.iter().map(|remark| format!("{object}: {remark}.")).collect();
         Ok(Self { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, remarks, bytes: size })
     }
@@ -161,7 +153,10 @@ mod tests {
         let near = |size: f32| {
             let means = vec![0.0, 0.0, 0.0, size, 0.0, 0.0, 0.0, size, 0.0];
             let gaussians = HostGaussians { means, log_scales: vec![(0.1 * size).ln(); 9], ..three(0) };
-            Content::read("t", ply::to_bytes(&gaussians, false).unwrap(), &Limits::default()).unwrap().scene.near
+            let near = Content::read("t", ply::to_bytes(&gaussians, false).unwrap(), &Limits::default()).unwrap().scene.near;
+            // As the rasterizer of an exact image draws them.
+            assert_eq!(near, near_without_units(gaussians.shown_box(), Rules::default().near()));
+            near
         };
         let usual = Rules::default().near();
         assert_eq!(near(100.0), usual);

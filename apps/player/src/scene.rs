@@ -6,12 +6,6 @@ use cc4dgs_format::{BLUR, Error, HostGaussians, Result, Rules};
 
 /// Floats of a Gaussian in [`Scene::gaussians`].
 pub(crate) const GAUSSIAN_FLOATS: usize = 16;
-/// Share of the centres along each axis that a first view shows: a few far away would make the model a dot.
-const SHOWN: f64 = 0.95;
-/// Standard deviations of a Gaussian of middle size that a first view shows at least: a single one is no point.
-const SHOWN_SIGMAS: f32 = 3.0;
-/// Largest standard deviation that counts for it: beyond, sums of squares leave float32.
-const MOST_SHOWN: f32 = 1e18;
 
 /// Gaussians in the layout of the shaders, moving ones first.
 pub struct Scene {
@@ -68,7 +62,7 @@ impl Scene {
             moving: layer.as_ref().map_or(0, |l| l.rows.len()),
             sh_degree: gaussians.sh_degree,
             drawn_degree: gaussians.sh_degree,
-            bounds: shown(gaussians),
+            bounds: gaussians.shown_box(),
             reach: gaussians.central_box(1.0),
             background: [0.0; 3],
             near: Rules::default().near(),
@@ -160,23 +154,6 @@ fn order(n: usize, layer: Option<&PlaybackLayer>) -> Vec<usize> {
     let rows: Vec<usize> = layer.into_iter().flat_map(|l| &l.rows).map(|&r| r as usize).collect();
     rows.iter().for_each(|&row| still[row] = false);
     rows.into_iter().chain((0..n).filter(|&i| still[i])).collect()
-}
-
-/// The box of most centres, along each axis no smaller than a Gaussian of middle size.
-fn shown(gaussians: &HostGaussians) -> [[f32; 3]; 2] {
-    let [lower, upper] = gaussians.central_box(SHOWN);
-    let mut sizes: Vec<f32> = gaussians.log_scales.as_chunks::<3>().0.iter().map(|s| s[0].max(s[1]).max(s[2])).collect();
-    if sizes.is_empty() {
-        return [lower, upper];
-    }
-    let middle = sizes.len() / 2;
-    let size = SHOWN_SIGMAS * sizes.select_nth_unstable_by(middle, f32::total_cmp).1.exp().min(MOST_SHOWN);
-    let axis = |k: usize| {
-        let center = 0.5 * lower[k] + 0.5 * upper[k];
-        [lower[k].min(center - size), upper[k].max(center + size)]
-    };
-    let [x, y, z] = [0, 1, 2].map(axis);
-    [0, 1].map(|end| [x[end], y[end], z[end]])
 }
 
 /// The coefficients of degree 1 to `degree`.

@@ -6,6 +6,7 @@ opened from disk, without a network. Chromium renders with SwiftShader, so no gr
 the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
+from browser_calls import calls
 from browser_destroy import destroyed
 from browser_faults import broken_module, fetched_meanwhile, few_degrees, half_arrived, hopeless, missing_files, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
 from browser_gaussian import one_gaussian, remarks
@@ -94,6 +95,7 @@ def main():
         arriving(pages, page, facts, len(archive), args.layers)
         degrees(pages, page)
         errors(pages, page)
+        calls(pages)
         told_once(pages)
         refused(pages)
         small_textures(pages)

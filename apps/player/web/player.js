@@ -21,6 +21,9 @@ export const PAGE_VERSION = 3;
 const MOST_RECOVERIES = 3;
 const KEPT_MS = 60000;
 
+// An address as text; other sources as they are.
+const addressed = source => (source instanceof URL ? source.href : source);
+
 const gone = () => new Error("This player was destroyed. Make another one with createPlayer.");
 
 let ready;
@@ -29,7 +32,7 @@ export async function createPlayer(container, options = {}) {
     const query = new URLSearchParams(location.search);
     const { src = query.get("src") ?? undefined, autoplay = query.has("autoplay"), backend = query.get("backend") } = options;
     const player = new Page(container, backend);
-    player.own = src;
+    player.own = addressed(src);
     const view = options.remember === false ? null : restore(player);
     try {
         // Another player may have it where this one could not fetch it.
@@ -142,16 +145,18 @@ class Page {
     /// `first` says how a model starts: with `pose` and `time`, else those of the link; `playing` when it can. `back` is why another one failed, which stays said.
     async load(source, name, first = null) {
         if (this.destroyed) throw gone();
+        source = addressed(source);
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
         [first, this.linked] = [first ?? this.linked ?? null, null];
         const again = this.gpu && source === this.source && this.facts;
         // How things stood when the first of this model was opened. A model that is loaded again goes on from there.
-        let before = null;
+        let before = null, played = false;
         const begin = () => {
             if (before || again && !first) this.first = this.now;
             before ??= this.now;
+            played = this.playing;
             this.failure = null;
         };
         [this.source, this.name, this.first] = [source, name, first];
@@ -162,14 +167,14 @@ class Page {
                 // A download that begins anew goes on with pose and time.
                 const anew = starts && !before;
                 if (anew) begin();
-                this.loaded(JSON.parse(this.gpu.openPart(download, layer, motion, degree, anew)), anew);
+                this.loaded(JSON.parse(this.gpu.openPart(download, layer, motion, degree, anew)), anew, anew && played);
             },
             harmonics: (download, degree) => { this.gpu.openHarmonics(download, degree); this.gl?.loadHarmonics(this.gpu); this.draw(); },
             whole: (name, bytes) => {
                 // A later load has the page; reading bytes is not interrupted.
                 if (signal.aborted) throw signal.reason;
                 begin();
-                this.loaded(JSON.parse(this.gpu.open(name, bytes)), true);
+                this.loaded(JSON.parse(this.gpu.open(name, bytes)), true, played);
             },
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
@@ -184,7 +189,7 @@ class Page {
                 await loadUrl(wasm, source, show, signal);
             } else {
                 const label = name ?? source.name ?? "model";
-                checkSize(label, source.size ?? 0);
+                checkSize(label, source.size ?? source.byteLength ?? 0);
                 const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer ? bytesOf(label, source) : source));
                 if (signal.aborted) return null;
                 this.ui.title(label);
@@ -229,8 +234,8 @@ class Page {
     /// Facts of the model that is drawn: while another one is fetched, those of the one before.
     get drawnFacts() { return this.facts ?? this.shown?.facts ?? null; }
     title() { return this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source?.name ?? "model"); }
-    /// A model is shown, or more of it; `anew` from its start.
-    loaded(facts, anew) {
+    /// A model is shown, or more of it; `anew` from its start. The one before `played`: its clock has ended.
+    loaded(facts, anew, played) {
         this.facts = facts;
         if (this.shown) this.shown.ended = false;
         this.gl?.load(this.gpu, facts.moving);
@@ -245,7 +250,7 @@ class Page {
             first.seen = true;
             if (first.pose) { this.setPose(first.pose, first.camera); this.seek(first.time); } else followLink(this);
         }
-        if (first?.playing && facts.frames > 1) { first.playing = false; this.play(); }
+        if (first?.playing && facts.frames > 1) { first.playing = false; this.play(); } else if (played) this.emit("pause", {});
         this.draw();
         this.ui.poster(null);
     }
@@ -274,14 +279,27 @@ class Page {
     }
     // View
     reset() { this.gpu?.reset(); this.moved(-1); }
-    goTo(index) { if (index < 0) return this.reset(); this.gpu?.goTo(index); this.moved(index); }
-    setPose(pose, camera) { if (this.gpu) this.gpu.pose = new Float64Array(pose); this.moved(camera); }
+    goTo(index) {
+        if (index < 0) return this.reset();
+        // A camera that the model does not have leaves the view as it is.
+        if (!this.drawnFacts || !(index < this.drawnFacts.cameras.length)) return;
+        this.gpu?.goTo(index);
+        this.moved(index);
+    }
+    setPose(pose, camera) {
+        const before = String(this.gpu?.pose);
+        if (this.gpu) this.gpu.pose = new Float64Array(pose);
+        // So does a pose that sees nothing.
+        if (camera !== undefined || String(this.gpu?.pose) !== before) this.moved(camera);
+    }
     /// The view is another one: that of a camera, or of none.
     moved(camera = "") {
         if (camera !== this.camera) this.ui.camera(this.camera = camera);
         this.dirty = true;
     }
     set(name, value) {
+        const names = [...Object.keys(this.settings), "flying"];
+        if (!names.includes(name)) throw new Error(`The player has no setting ${name}. Use one of ${names.join(", ")}.`);
         if (name === "flying") this.flying = value; else this.settings[name] = value;
         this.ui.settings({ ...this.settings, flying: this.flying });
         this.apply();

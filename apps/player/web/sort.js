@@ -2,10 +2,10 @@
 // sort at once.
 
 /// Indices of the Gaussians before the camera, farthest first; of equal keys the later Gaussian first, as on the GPU. Keys are 16 bits of the logarithm of depth.
-/// `model` is what `sortable` returns. `view` has `row`, the third row of world to camera, the `near` plane, φ of all heads as `functions`, and of the centres' head the
-/// `track` (-1: none) and the index `first` of its first function. Refers to nothing outside itself: the worker runs its text.
+/// `model` is what `sortable` returns. `view` has `row`, the third row of world to camera, the `near` plane, and of the centres' head the `track` (-1: none) and φ as
+/// `functions`. Refers to nothing outside itself: the worker runs its text.
 export function sortByDepth(model, view) {
-    const { means, starts, coefficients, moving } = model, { near, track, first, functions } = view, [x, y, z, w] = view.row;
+    const { means, starts, coefficients, moving } = model, { near, track, functions } = view, [x, y, z, w] = view.row;
     const LAST_KEY = 65535;
     const count = means.length / 3, depths = new Float32Array(count);
     let low = Infinity, high = 0, visible = 0;
@@ -13,7 +13,7 @@ export function sortByDepth(model, view) {
         let depth = x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + w;
         if (track >= 0 && i < moving) {
             const end = starts[track + i + 1];
-            for (let c = starts[track + i], f = first; c < end; c++, f++) {
+            for (let c = starts[track + i], f = 0; c < end; c++, f++) {
                 depth += functions[f] * (x * coefficients[3 * c] + y * coefficients[3 * c + 1] + z * coefficients[3 * c + 2]);
             }
         }
@@ -69,7 +69,7 @@ onmessage = ({ data }) => {
 
 function same(a, b) {
     const equal = (p, q) => p.length === q.length && p.every((v, i) => v === q[i]);
-    return a !== null && b !== null && a.near === b.near && a.track === b.track && a.first === b.first && equal(a.row, b.row) && equal(a.functions, b.functions);
+    return a !== null && b !== null && a.near === b.near && a.track === b.track && equal(a.row, b.row) && equal(a.functions, b.functions);
 }
 
 /// Orders of one model. A later model gets another sorter, so that a late answer cannot reach it.

@@ -301,8 +301,10 @@ export class WebGl {
     /// The order for the frame with the uniforms `bytes`: its own where it is a capture, else the newest that there is.
     order(bytes, functions, capture) {
         if (!this.sorter) return NONE;
-        const floats = new Float32Array(bytes.buffer, 0, 36), [start, , first, width] = new Uint32Array(bytes.buffer, 176, 4);
-        const view = { row: floats.slice(8, 12), near: floats[26], track: width ? this.tracks.get(start) : -1, first, functions };
+        const floats = new Float32Array(bytes.buffer, 0, 36), heads = new Uint32Array(bytes.buffer, 176, 20), [start, , first, width] = heads;
+        // φ of the centres alone, up to that of the next head: what only opacity or colour change leaves the order as it is.
+        const next = [4, 8, 12, 16].find(head => heads[head + 3]), end = width ? heads[next + 2] ?? functions.length : first;
+        const view = { row: floats.slice(8, 12), near: floats[26], track: width ? this.tracks.get(start) : -1, functions: functions.slice(first, end) };
         if (capture) return this.sorter.sort(view);
         const order = this.sorter.newest(view);
         [this.visible, this.settled] = [order.length, this.sorter.has(view)];

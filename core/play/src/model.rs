@@ -1,17 +1,14 @@
 //! A trained model: canonical Gaussians, the field that moves them, and how they want to be drawn.
 
 use crate::checkpoint;
-use crate::orbit::middle_and_radius;
 use crate::source::{Source, SourceKind};
 use crate::{Moving, RenderConfig, default_rasterizer};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, Provenance};
+use cc4dgs_core::format::near_without_units;
 use cc4dgs_core::{Deformer, DeformerContext, Error, Event, EventSink, GaussianFile, HostGaussians, Limits, Registry, Result, Similarity, ply, spz};
 use serde::Serialize;
 use std::path::Path;
-
-/// The smallest depth drawn of a model in unknown units, as a share of its radius; cameras that see the whole model are some three radii away.
-const NEAR_OF_RADIUS: f64 = 0.01;
 
 /// A model, wherever it came from.
 pub struct Model {
@@ -112,8 +109,8 @@ impl Model {
     /// A static model of `gaussians` that take `bytes` in their file. The file does not say its units: cameras around a small model are near it too.
     pub(crate) fn from_static(file: GaussianFile, bytes: u64) -> Self {
         let GaussianFile { gaussians, antialiased, .. } = file;
-        let near = (middle_and_radius(&gaussians).1 * NEAR_OF_RADIUS) as f32;
         let usual = RenderConfig::default();
+        let near = near_without_units(gaussians.shown_box(), usual.rules.near());
         Self {
             gaussians,
             field: None,

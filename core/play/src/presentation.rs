@@ -84,8 +84,9 @@ fn upward(cameras: &[Camera]) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cc4dgs_core::GaussianFile;
     use cc4dgs_core::archive::Manifest;
+    use cc4dgs_core::format::near_without_units;
+    use cc4dgs_core::{GaussianFile, Rules};
 
     #[test]
     fn up_is_that_of_upright_cameras_whatever_they_look_at() {
@@ -117,7 +118,12 @@ mod tests {
         let near = |size: f32| {
             let gaussians =
                 HostGaussians { means: (0..30).map(|k| size * (k as f32 * 0.7).sin()).collect(), opacity_logits: vec![3.0; 10], ..Default::default() };
-            Model::from_static(GaussianFile { gaussians, ..Default::default() }, 0).render.near
+            let usual = Rules::default().near();
+            // As the player draws them.
+            let expected = near_without_units(gaussians.shown_box(), usual);
+            let near = Model::from_static(GaussianFile { gaussians, ..Default::default() }, 0).render.near;
+            assert_eq!(near.unwrap_or(usual), expected);
+            near
         };
         assert_eq!(near(100.0), None);
         let small = near(1e-3).unwrap();

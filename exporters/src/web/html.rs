@@ -58,9 +58,9 @@ fn document(title: &str, head: &str, body: &str) -> String {
     out
 }
 
-/// The page of a folder: it loads `model`, or what its address asks for (`?src=`).
+/// The page of a folder: it loads `model` under the name `title`, or what its address asks for (`?src=`); `?autoplay` plays it even where `autoplay` is off.
 pub(super) fn of_folder(title: &str, model: &str, autoplay: bool) -> String {
-    let options = script_json(&json!({ "autoplay": autoplay, "src": model }));
+    let options = script_json(&json!({ "autoplay": autoplay, "name": title, "src": model }));
     let body = format!(
         r#"<script>
 if (location.protocol === "file:") document.getElementById("player").textContent =
@@ -74,7 +74,10 @@ const {{ createPlayer }} = await import("./player.js").catch(e => {{
     throw e;
 }});
 const options = {options};
-options.src = new URLSearchParams(location.search).get("src") ?? options.src;
+const query = new URLSearchParams(location.search), asked = query.get("src");
+// Another model has the name of its file.
+if (asked !== null && asked !== options.src) Object.assign(options, {{ src: asked, name: undefined }});
+options.autoplay ||= query.has("autoplay");
 window.cc4dgs = await createPlayer(element, options);
 </script>"#
     );
@@ -174,6 +177,16 @@ mod tests {
         assert!(loads < says && html.contains("cc4dgs_player.js and all others of its folder"), "{html}");
         // The page that build-web copies says the same.
         assert!(include_str!("../../../apps/player/web/index.html").contains(html[says..].lines().next().unwrap()));
+    }
+
+    #[test]
+    fn both_pages_name_the_model_and_say_what_they_need_without_scripts() {
+        for html in [of_folder("mutant", "model.cc4d", true), single(&page(), "mutant", b"archive", true).unwrap()] {
+            assert!(html.contains("<title>mutant</title>") && html.contains(r#""name":"mutant""#), "{html}");
+            assert!(html.contains("<noscript>This page needs JavaScript."), "{html}");
+        }
+        let folder = of_folder("mutant", "model.cc4d", true);
+        assert!(folder.contains("Object.assign(options, { src: asked, name: undefined })") && folder.contains(r#"query.has("autoplay")"#), "{folder}");
     }
 
     #[test]

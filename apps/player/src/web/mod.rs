@@ -344,7 +344,8 @@ impl Player {
     pub fn set_depth(&mut self, on: bool) {
         self.look.mode = if on { Mode::Depth } else { Mode::Color };
     }
-    /// The RGBA pixels of the current view at the size of the canvas, or through `camera` (JSON of a camera) at `time`; a promise of a [`Capture`].
+    /// The RGBA pixels of the current view, in the size in which it is drawn (that of the canvas times `resolution`), or of `camera` (JSON of a camera) in the
+    /// size of that camera; at `time`, by default that of the clock. A promise of a [`Capture`].
     pub fn capture(&mut self, camera: Option<String>, time: Option<f32>) -> Result<js_sys::Promise, JsError> {
         let view = self.view_of(camera, time)?;
         let Output::WebGpu { renderer, .. } = &mut self.output else { return Err(JsError::new("the page draws by itself")) };

@@ -300,7 +300,7 @@ impl eframe::App for Window {
         self.lost.note(self.command());
         let elapsed = ctx.input(|i| i.stable_dt).min(0.25);
         self.rate += 0.1 * (1.0 / elapsed.max(1e-4) - self.rate);
-        if self.clock.tick(elapsed) {
+        if self.clock.tick(elapsed) || self.clock.runs() {
             ctx.request_repaint();
         }
         self.follow();
