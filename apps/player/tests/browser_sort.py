@@ -12,7 +12,7 @@ STILL = """async () => {
 }"""
 MOVE = "([time, turn]) => { cc4dgs.seek(time); cc4dgs.gpu.orbit(turn, 0.1); cc4dgs.draw(); return cc4dgs.gl.settled; }"
 SETTLED = "cc4dgs.gl.settled && !cc4dgs.dirty"
-# Whether the order stays where φ of another head than the centres' changes, and where theirs does; none without such heads.
+# Whether the order stays where φ of another head than the centres' changes, and where theirs does; null if the model has no such heads.
 HEADS = """() => {
     const { gl, gpu } = cc4dgs, bytes = gpu.plainFrame().slice(), functions = gpu.plainFunctions(), heads = new Uint32Array(bytes.buffer, 176, 20);
     const other = [4, 8, 12, 16].find(head => heads[head + 3]);
@@ -43,7 +43,8 @@ def sorting(pages, page):
     page.wait_for_timeout(500)
     assert page.evaluate("draws") == 0, "the page draws although nothing changes"
     page.evaluate("cc4dgs.draw = draw; 0")
-    assert page.evaluate(HEADS) in (None, [True, False]), "the order does not follow the functions of the centres alone"
+    heads = page.evaluate(HEADS)
+    assert heads == [True, False], f"the order does not follow the functions of the centres alone: {heads}"
     still(page, "after functions that were not the frame's")
     ms = page.evaluate(SORT)
 

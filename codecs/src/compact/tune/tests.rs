@@ -223,8 +223,7 @@ fn what_is_coded_is_quantised_once() {
 #[test]
 fn what_the_search_has_found_is_not_made_again() {
     with_job(2, |job, _, _, _| {
-        let camera = Camera::look_at("t", (2, 2), 1.0, [4.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
-        let view = Uneven { colors: job.planner.gaussians.sh_dc.to_vec(), camera, lost: 0.03 };
+        let view = Uneven::new(job.planner.gaussians.sh_dc, 0.03);
         let whole = job.planner.gaussians.to_host();
         let (attempt, streams) = job.coded(&job.planner, 0.01, &job.factors).unwrap();
         assert!(job.repeats(&attempt, 0.01, &[1.0; 6]) && !job.repeats(&attempt, 0.02, &[1.0; 6]) && !job.repeats(&attempt, 0.01, &[2.0; 6]));
@@ -241,8 +240,7 @@ fn what_the_search_has_found_is_not_made_again() {
 #[test]
 fn no_change_of_harmonics_is_tried_where_there_are_none() {
     with_job(0, |job, _, _, _| {
-        let camera = Camera::look_at("t", (2, 2), 1.0, [4.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
-        let view = Uneven { colors: job.planner.gaussians.sh_dc.to_vec(), camera, lost: 0.03 };
+        let view = Uneven::new(job.planner.gaussians.sh_dc, 0.03);
         let whole = job.planner.gaussians.to_host();
         CODED.set(0);
         let factors = allocate(job, 0.01, None, &whole, &view, &view).unwrap();
@@ -269,6 +267,12 @@ struct Uneven {
     colors: Vec<f32>,
     camera: Camera,
     lost: f64,
+}
+
+impl Uneven {
+    fn new(colors: &[f32], lost: f64) -> Self {
+        Self { colors: colors.to_vec(), camera: Camera::look_at("t", (2, 2), 1.0, [4.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]), lost }
+    }
 }
 
 impl TrainingViews for Uneven {
@@ -299,8 +303,7 @@ impl RenderModel for Uneven {
 fn a_search_that_runs_out_of_attempts_says_so() {
     with_job(0, |job, _, context, events| {
         for (lost, ends) in [(0.03, true), (0.049, false)] {
-            let camera = Camera::look_at("t", (2, 2), 1.0, [4.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
-            let uneven = Uneven { colors: job.planner.gaussians.sh_dc.to_vec(), camera, lost };
+            let uneven = Uneven::new(job.planner.gaussians.sh_dc, lost);
             let context = CodecContext { views: Some(&uneven), renderer: Some(&uneven), ..*context };
             let before = events.events().len();
             search(job, &Settings { max_drop_db: 0.05, finetune: 0, allocate: false, ..Default::default() }, &context).unwrap();

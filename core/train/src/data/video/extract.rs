@@ -136,7 +136,8 @@ impl VideoFrames {
         let bug = || Error::parameter(format!("video {}", video.display()), format!("frame {frame} was not asked for"), "Reopen the scene");
         let clip = self.clips.get(video).ok_or_else(bug)?;
         let rank = clip.wanted.rank(frame).ok_or_else(bug)?;
-        let what = format!("rgb24|{}|{:?}", clip.wanted.condition(), clip.size);
+        // Older caches, of images that were matched by their order alone, have names without "by time".
+        let what = format!("rgb24 by time|{}|{:?}", clip.wanted.condition(), clip.size);
         let folder = cache_folder(&self.options)?.join(cache_name(video, &what)?);
         // A poisoned lock only means that another extraction failed; this one may do better.
         let _guard = clip.busy.lock().unwrap_or_else(|e| e.into_inner());
