@@ -118,8 +118,11 @@ fn not_finite(table: &toml::Table) -> Option<(String, f64)> {
 }
 
 /// Keys of earlier versions and what replaces them.
-const RENAMED: [(&str, &str); 2] =
-    [("train.densify", "[density], such as density.max_gaussians"), ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\"")];
+const RENAMED: [(&str, &str); 3] = [
+    ("train.densify", "[density], such as density.max_gaussians"),
+    ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\""),
+    ("density.reset_in_main", "density.reset_main_every, the iterations between two resets; 3000 where it was true"),
+];
 
 /// Refuses keys of earlier versions; the error names the new ones.
 fn refuse_renamed(table: &toml::Table) -> Result<()> {

@@ -102,4 +102,20 @@ mod tests {
             assert_eq!(Schedule::main(config.train.iterations).at(from as usize), first, "{name}");
         }
     }
+
+    #[test]
+    fn opacities_are_reset_and_gaussians_grow_at_published_iterations() {
+        let rows = [("hexplane", 10_000), ("native-4d", 15_000), ("deform-mlp", 12_000), ("grid4d", 12_000)];
+        for (method, last) in rows {
+            let config = RunConfig::resolve(Some(&format!("dnerf+{method}")), None, &[]).unwrap();
+            let [coarse, _, main] = config.train.shares;
+            let schedule = Schedule::main((config.train.iterations as f64 * main / (coarse + main)).round() as usize);
+            let at = |key: &str| schedule.at(config.density[key].as_integer().unwrap() as usize);
+            assert!(at("reset_main_every").abs_diff(3000) <= 1, "{method}: {}", at("reset_main_every"));
+            // Shares of a main stage are whole numbers of its reference: up to 27 iterations off.
+            assert!(at("until").abs_diff(last) <= 27, "{method}: {}", at("until"));
+        }
+        let config = RunConfig::resolve(Some("n3dv+hexplane"), None, &[]).unwrap();
+        assert_eq!(Schedule::main(14_000).at(config.density["until"].as_integer().unwrap() as usize), 10_000);
+    }
 }

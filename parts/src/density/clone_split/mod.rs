@@ -24,7 +24,7 @@ max_scale_share = 0.0    # larger Gaussians are removed, as a share of the exten
 min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
 weight_every = 3000      # reference iterations between two weight prunings; 0 is off
 reset_every = 3000       # reference iterations between two opacity resets of the coarse stage, to 0.01 or twice min_opacity; 0 is off
-reset_in_main = false    # reset opacities in the main stage, too, until the last round
+reset_main_every = 0     # the same in the main stage, until the last round, in reference iterations of that stage; 0 is off
 max_gaussians = 400000   # at this count or more, no Gaussians are added
 ";
 
@@ -56,7 +56,7 @@ struct Settings {
     min_weight: f32,
     weight_every: usize,
     reset_every: usize,
-    reset_in_main: bool,
+    reset_main_every: usize,
     max_gaussians: usize,
 }
 
@@ -75,7 +75,7 @@ impl Default for Settings {
             min_weight: 0.02,
             weight_every: 3000,
             reset_every: 3000,
-            reset_in_main: false,
+            reset_main_every: 0,
             max_gaussians: 400_000,
         }
     }
@@ -97,12 +97,14 @@ impl Settings {
     /// The actions due after this iteration.
     fn due(&self, schedule: &Schedule) -> Due {
         let (iteration, end) = (schedule.iteration, self.end(schedule));
-        let reset_interval = schedule.at(self.reset_every).max(1);
-        let resets = schedule.stage == Stage::Coarse || (self.reset_in_main && iteration < end);
+        let (reset_every, resets) = match schedule.stage {
+            Stage::Coarse => (self.reset_every, true),
+            _ => (self.reset_main_every, iteration < end),
+        };
         Due {
             grow: iteration > schedule.at(self.from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
             prune_weight: self.weight_every > 0 && iteration < end && iteration.is_multiple_of(self.weight_interval(schedule)),
-            reset: resets && self.reset_every > 0 && iteration.is_multiple_of(reset_interval) && schedule.left() >= MIN_RECOVERY,
+            reset: resets && reset_every > 0 && iteration.is_multiple_of(schedule.at(reset_every).max(1)) && schedule.left() >= MIN_RECOVERY,
             held: 0,
         }
     }
@@ -233,6 +235,21 @@ mod tests {
             let error = build(&toml::from_str(section).unwrap()).err().unwrap().to_string();
             assert!(error.contains(&format!("clone-split: {key}")) && error.contains("usual"), "{error}");
         }
+    }
+
+    #[test]
+    fn each_stage_has_resets_of_its_own() {
+        let resets = |text: &str, stage: Stage, length: usize| {
+            let settings: Settings = toml::from_str(text).unwrap();
+            let at = |iteration: usize| Schedule { stage, iteration, total: 40_000, ..Schedule::main(length) };
+            (1..=length).filter(|&iteration| settings.due(&at(iteration)).reset).collect::<Vec<_>>()
+        };
+        assert_eq!(resets("", Stage::Coarse, 5000), [3000]);
+        assert!(resets("", Stage::Main, 20_000).is_empty());
+        let both = "reset_every = 1000\nreset_main_every = 2000\nuntil = 10000";
+        assert_eq!(resets(both, Stage::Coarse, 5000), [1000, 2000, 3000, 4000]);
+        assert_eq!(resets(both, Stage::Main, 30_000), [3000, 6000, 9000, 12_000]);
+        assert!(resets("reset_every = 0\nreset_main_every = 0", Stage::Coarse, 5000).is_empty());
     }
 
     #[test]
