@@ -8,9 +8,9 @@ the path. Ends with a sentence per check; fails at the first that does not hold.
 import argparse, pathlib, time
 from browser_calls import calls
 from browser_destroy import destroyed
-from browser_faults import broken_module, fetched_meanwhile, few_degrees, half_arrived, hopeless, missing_files, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
+from browser_faults import broken_module, cancelled, fetched_meanwhile, few_degrees, half_arrived, hopeless, missing_files, opened_early, opened_meanwhile, out_of_memory, refused, second_player, small_textures, told_once
 from browser_gaussian import one_gaussian, remarks
-from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, layouts, low, reduced_motion, touch, wheel
+from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, layouts, low, reduced_motion, touch, typing, wheel
 from browser_keep import frames, reloaded, several, shapes
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
@@ -87,6 +87,7 @@ def main():
         command_key(page)
         layouts(page)
         held(page)
+        typing(page)
         cameras(page)
         key_list(page)
         shapes(pages, page)
@@ -100,10 +101,12 @@ def main():
         refused(pages)
         small_textures(pages)
         half_arrived(pages)
-        no_room(pages)
+        cancelled(pages)
+        out_of_memory(pages)
         few_degrees(pages)
         one_gaussian(pages)
         remarks(pages)
+        opened_early(pages)
         opened_meanwhile(pages)
         fetched_meanwhile(pages)
         second_player(pages)

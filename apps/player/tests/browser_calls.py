@@ -18,6 +18,15 @@ STILL = """async () => { const { draw } = cc4dgs;
     cc4dgs.draw = draw, cc4dgs.set("speed", 1), cc4dgs.pause();
     return draws; }"""
 
+# Loads a model, and another one in a listener of its progress. Returns what the first call resolves to, frames and source of the second, and what is shown.
+RIVALS = """async address => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(address)).arrayBuffer());
+    window.fetch = async () => new Response(bytes, { headers: { "Content-Length": String(bytes.length) } });
+    let second = null;
+    const stop = cc4dgs.on("progress", () => { stop(); second = cc4dgs.load("/second.cc4d"); });
+    const first = await cc4dgs.load("/first.cc4d"), facts = await second;
+    window.fetch = fetch;
+    return [first, facts.frames, cc4dgs.source, cc4dgs.shown.source]; }"""
+
 
 def calls(pages):
     page = pages.open(f"?src={MODEL}")
@@ -28,6 +37,9 @@ def calls(pages):
     assert told == ["play", "pause"] and not playing, f"a model that takes the place of one that plays: {told}"
     assert isinstance(source, str) and source.endswith(MODEL + "?other"), source
     assert page.evaluate(STILL) == 0, "the page draws although time stands still"
+    frames = page.evaluate("cc4dgs.facts.frames")
+    rivals = page.evaluate(RIVALS, MODEL)
+    assert rivals == [None, frames, "/second.cc4d", "/second.cc4d"], f"a model that another one replaced goes on: {rivals}"
     page.close()
     pages.quiet("calls")
     say("unknown settings are refused, a new model ends the playback of the one before, and nothing is drawn at speed 0")

@@ -21,7 +21,7 @@ DESTROY = """async source => { const player = cc4dgs, { fetch, requestAnimationF
     Object.assign(window, { fetch, requestAnimationFrame });
     GPUDevice.prototype.destroy = destroy;
     return { frames, devices, keys, fetching: !signal.aborted, loaded: await loading, refused, memory: gpu.__wbg_ptr !== 0,
-        context: !!gl && !gl.gl.isContextLost(), worker: !!gl?.sorter.worker, elements: document.getElementById("player").childElementCount }; }"""
+        context: !!gl && !gl.gl.isContextLost(), worker: !!gl?.sorter.worker, buffers: gl?.capacity ?? 0, textures: Object.keys(gl?.textures ?? {}).length, elements: document.getElementById("player").childElementCount }; }"""
 # A second player, inside of a page whose first one is the page's own.
 INSIDE = """import('./player.js').then(async m => { const box = document.body.appendChild(document.createElement('div'));
     box.style.cssText = 'position:fixed;left:0;top:0;width:160px;height:120px'; window.inner = await m.createPlayer(box); })"""

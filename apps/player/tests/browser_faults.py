@@ -1,5 +1,5 @@
 """Checks of browser.py: what the page says where memory, textures, devices or connections fail."""
-from browser_pages import MODEL, PATIENCE_MS, say
+from browser_pages import Handler, MODEL, PATIENCE_MS, say
 
 # Counts what players of the page tell, from their first message on.
 TOLD = """async source => { const { createPlayer } = await import("./player.js"), own = cc4dgs.constructor.prototype, { emit } = own;
@@ -53,8 +53,28 @@ UNREAD = """() => { const folder = new File([], "folder");
     folder.arrayBuffer = () => Promise.reject(new DOMException("not found", "NotFoundError"));
     return cc4dgs.load(folder).then(() => "it loaded", e => e.message); }"""
 # A WebGL2 without memory, and one that cannot draw images.
-NO_ROOM = "() => { WebGL2RenderingContext.prototype.getError = function () { return this.OUT_OF_MEMORY; }; }"
+NO_MEMORY = "() => { WebGL2RenderingContext.prototype.getError = function () { return this.OUT_OF_MEMORY; }; }"
 NO_IMAGE = "() => { WebGL2RenderingContext.prototype.checkFramebufferStatus = function () { return this.FRAMEBUFFER_UNSUPPORTED; }; }"
+# Draws an image that fails. Returns what is told, and how many of the objects that were made for it are still there.
+FAILED_IMAGE = """async () => { const { gl } = cc4dgs.gl, made = [], own = WebGL2RenderingContext.prototype;
+    for (const name of ["createTexture", "createFramebuffer"]) gl[name] = () => { made.push(own[name].call(gl)); return made.at(-1); };
+    cc4dgs.gl.target = () => { throw new Error("on purpose"); };
+    const told = await cc4dgs.capture().then(() => "it is drawn", e => e.message);
+    delete gl.createTexture, delete gl.createFramebuffer, delete cc4dgs.gl.target;
+    return [told, made.length, made.filter(one => (one instanceof WebGLTexture ? gl.isTexture(one) : gl.isFramebuffer(one))).length]; }"""
+# Loads a model over a connection that breaks once nothing more is read of it.
+CANCELLED = """async source => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
+    const body = new ReadableStream({ start: controller => controller.enqueue(bytes), cancel: () => { throw new TypeError("on purpose"); } });
+    window.fetch = async () => new Response(body, { headers: { "Content-Length": String(bytes.length) } });
+    const told = await cc4dgs.load("/cancelled.cc4d").then(facts => facts.frames, e => e.message);
+    window.fetch = fetch;
+    return told; }"""
+# The module is not fetched before `go` is called.
+HELD = """() => { const { fetch } = window;
+    window.fetch = async (address, options) => {
+        if (String(address.url ?? address).endsWith(".wasm")) await new Promise(done => { window.go = done; });
+        return fetch(address, options);
+    }; }"""
 ALERT = "document.querySelector('[role=alert]')?.innerText ?? ''"
 
 
@@ -113,17 +133,48 @@ def half_arrived(pages):
     say("time, pose and playback stay where a connection breaks; a model that arrives goes on after a broken file")
 
 
-def no_room(pages):
-    """What the memory of the graphics card has no room for is a sentence, told once."""
+def cancelled(pages):
+    """A connection that breaks once all that is needed has arrived harms nothing."""
+    page = pages.open()
+    told = page.evaluate(CANCELLED, MODEL)
+    assert isinstance(told, int) and told > 1, told
+    page.close()
+    pages.quiet("a connection that breaks at the end")
+    say("a connection may break once all that is needed has arrived")
+
+
+def opened_early(pages):
+    """A file that is opened before the module has arrived is shown, and stays where the page has a model of its own."""
+    for query in ("", f"?src={MODEL}"):
+        page = pages.watch(pages.browser.new_page())
+        page.add_init_script(f"({HELD})()")
+        page.goto(f"{pages.address}/index.html{query}", wait_until="commit")
+        page.wait_for_function("window.go !== undefined")
+        page.set_input_files("input[type=file]", {"name": "early.cc4d", "mimeType": "application/octet-stream", "buffer": Handler.archives[MODEL]})
+        page.evaluate("go()")
+        page.wait_for_function(f"window.cc4dgs && (cc4dgs.facts || ({ALERT}))")
+        found = page.evaluate(f"[cc4dgs.source?.name, cc4dgs.facts?.frames > 1, {ALERT}]")
+        assert found == ["early.cc4d", True, ""], f"a file that is opened before the module has arrived: {found}"
+        page.close()
+    pages.quiet("a file that was opened early")
+    say("a file can be opened before the module has arrived")
+
+
+def out_of_memory(pages):
+    """Too little memory of the graphics card is a sentence, told once; what was allocated is given back."""
     page = pages.open("?backend=webgl")
-    page.evaluate(NO_ROOM)
+    told, made, left = page.evaluate(FAILED_IMAGE)
+    assert told == "on purpose" and made == 2 and left == 0, f"an image that fails leaves {left} of {made} objects: {told}"
+    page.evaluate(NO_MEMORY)
     message = page.evaluate(f"cc4dgs.load('{MODEL}').then(() => 'it loaded', e => e.message)")
-    assert "no room for the model" in message and page.evaluate("cc4dgs.facts") is None and message[:20] in page.evaluate(ALERT), message
+    assert "too little free memory for the model" in message and page.evaluate("cc4dgs.facts") is None and message[:20] in page.evaluate(ALERT), message
+    assert page.evaluate("cc4dgs.gl.capacity + Object.keys(cc4dgs.gl.textures).length") == 0, "a model that is refused stays on the graphics card"
     page.close()
     page = pages.open("?backend=webgl")
     page.evaluate(NO_IMAGE)
-    page.evaluate("cc4dgs.set('resolution', 0.5)")
+    page.evaluate("window.device = cc4dgs.gpu; cc4dgs.set('resolution', 0.5)")
     page.wait_for_function(f"({ALERT}).includes('cannot draw an image of')")
+    assert page.evaluate("device.__wbg_ptr") == 0, "a player that has stopped keeps its model"
     page.close()
     # The page writes what stops it to the console.
     pages.complaints[:] = [c for c in pages.complaints if "cannot draw" not in c]

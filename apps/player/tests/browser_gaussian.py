@@ -29,6 +29,7 @@ def one_gaussian(pages):
         page.evaluate(OPEN, [0.05, 0.05, 0.05])
         brightest = page.evaluate(BRIGHTEST)
         assert brightest > 150, f"a single Gaussian is not seen: at most {brightest}"
+        assert page.evaluate("cc4dgs.gl?.capacity ?? 1") == 1, "the order of a single Gaussian takes more memory"
         for key in ("End", ".", " "):
             page.keyboard.press(key)
         still = page.evaluate("[cc4dgs.time, cc4dgs.playing, document.querySelector('.bar output').textContent]")

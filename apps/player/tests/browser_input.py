@@ -95,6 +95,17 @@ def held(page):
     say("a key that is held down switches once, or steps on")
 
 
+def typing(page):
+    """Keys that a text field of the page takes do not reach the player."""
+    taken = page.evaluate("""() => [["input", {}], ["textarea", {}], ["div", { contentEditable: "true" }]].map(([tag, own]) => {
+        const field = document.body.appendChild(Object.assign(document.createElement(tag), own));
+        const typed = field.dispatchEvent(new KeyboardEvent("keydown", { key: "w", code: "KeyW", bubbles: true, cancelable: true }));
+        field.remove();
+        return !typed || cc4dgs.flyKeys(0); })""")
+    assert not any(taken), f"the player takes the keys of a text field: {taken}"
+    say("text fields beside the player keep their keys")
+
+
 def cameras(page):
     """The list of cameras says where the view is from, so that the same camera can be chosen again."""
     chosen = "document.querySelector('.panel select').selectedOptions[0].textContent"

@@ -45,14 +45,14 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             assert self.headers.get("If-Range") == '"1"', "parts are asked for without a condition"
             if path not in Handler.broken:
                 Handler.broken.add(path)
-                part, place = self.part(wanted, body)
-                return self.answer(part, 206, {**version, "Content-Range": place}, cut=len(part) // 2)
+                part, extent = self.part(wanted, body)
+                return self.answer(part, 206, {**version, "Content-Range": extent}, cut=len(part) // 2)
         if not wanted or "plain" in path:
             return self.answer(body, 200, {}, pieces)
         if not body:
             return self.answer(body, 416, {"Content-Range": "bytes */0"})
-        part, place = self.part(wanted, body)
-        self.answer(part, 206, {**version, "Content-Range": place}, pieces)
+        part, extent = self.part(wanted, body)
+        self.answer(part, 206, {**version, "Content-Range": extent}, pieces)
 
     def end_headers(self):
         # Frames without storage are of a site of their own.

@@ -21,6 +21,26 @@ HEADS = """() => {
 }"""
 FAILURE = "cc4dgs.gl.sorter.worker.dispatchEvent(new ErrorEvent('error', { message: 'on purpose', cancelable: true }))"
 
+# Draws frames of four times and views, each with its own order, and the last one again. Returns how often that allocates or writes memory of the graphics card.
+WRITES = """() => {
+    const { gl, sorter } = cc4dgs.gl, own = WebGL2RenderingContext.prototype, counts = {};
+    const names = ["createTexture", "texImage2D", "texStorage2D", "createBuffer", "bufferData", "texSubImage2D", "bufferSubData"];
+    for (const name of names) {
+        counts[name] = 0;
+        gl[name] = (...all) => { counts[name]++; return own[name].apply(gl, all); };
+    }
+    for (let k = 1; k < 5; k++) {
+        cc4dgs.seek(k / 5), cc4dgs.gpu.orbit(0.3, 0);
+        // Without an order the page sorts at once.
+        sorter.order = null;
+        cc4dgs.draw();
+    }
+    cc4dgs.draw();
+    names.forEach(name => { delete gl[name]; });
+    return counts;
+}"""
+CAPACITY = "[cc4dgs.gl.capacity, cc4dgs.facts.gaussians]"
+
 # Milliseconds of a sort on the page's thread.
 SORT = """() => { const { sorter } = cc4dgs.gl, began = performance.now();
     for (let i = 0; i < 5; i++) sorter.sort(sorter.view);
@@ -46,6 +66,11 @@ def sorting(pages, page):
     heads = page.evaluate(HEADS)
     assert heads == [True, False], f"the order does not follow the functions of the centres alone: {heads}"
     still(page, "after functions that were not the frame's")
+    *allocations, textures, buffers = page.evaluate(WRITES).values()
+    assert not any(allocations) and textures == buffers == 4, f"frames allocate memory {allocations} times, and write it {textures} and {buffers} times"
+    still(page, "after frames that were written in turn")
+    capacity, gaussians = page.evaluate(CAPACITY)
+    assert capacity == gaussians, f"the order has a capacity of {capacity} for {gaussians} Gaussians"
     ms = page.evaluate(SORT)
 
     # Another model while an answer is under way.
@@ -59,7 +84,7 @@ def sorting(pages, page):
     still(page, "after the worker failed")
     page.evaluate("address => cc4dgs.load(address).then(() => 0)", MODEL)
     assert page.evaluate("!!cc4dgs.gl.sorter.worker"), "the next model has no worker"
-    say(f"the worker sorts what is shown; still images are the exact ones, also after it failed; a sort takes {ms:.1f} ms")
+    say(f"frames write to memory that is there; the worker sorts what is shown; still images are the exact ones, also after it failed; a sort takes {ms:.1f} ms")
 
     without = pages.open(f"?src={MODEL}&backend=webgl", before="delete self.Worker")
     assert without.evaluate("cc4dgs.gl.sorter.worker") is None and without.evaluate(MOVE, [0.4, 0.4])

@@ -133,7 +133,7 @@ export function build(container, player) {
     // Screen readers would read it out with every frame.
     const clock = element("output", { textContent: "–", attributes: { "aria-live": "off" } });
     const speeds = [0.1, 0.25, 0.5, 1, 2, 4];
-    // Phones have no room for it in the bar.
+    // On phones the bar is too narrow for it.
     const [speed, narrowSpeed] = ["wide", ""].map(className => element("select", { className, ...labelled("Speed"), onchange: e => player.set("speed", Number(e.target.value)) },
         ...speeds.map(v => element("option", { value: v, textContent: `${v}×` }))));
     const loop = button("⟳", "Loop", () => player.set("looping", !player.settings.looping));

@@ -101,8 +101,9 @@ export function addKeys(element, act, commands, signal) {
         // Another player, inside of this one's page, has acted on it.
         if (e.defaultPrevented || e.ctrlKey || e.metaKey || e.altKey) return;
         const key = nameOfKey(e);
-        // Lists choose by letters.
-        if (key !== "Escape" && e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
+        // Lists choose by letters, and a page may have text fields beside the player.
+        const types = e.target.isContentEditable || e.target.closest("select, textarea, input:not([type=range]):not([type=checkbox]):not([type=file])");
+        if (key !== "Escape" && types) return;
         if (FLY[key]) { held.set(positionOf(e), key); e.preventDefault(); return; }
         // Sliders keep the keys that move them, buttons and boxes those that press them.
         const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input, summary") && (key === " " || key === "Enter");

@@ -47,7 +47,10 @@ async function drain(name, response, offset, sink) {
         if (done) return offset;
         let go = false;
         // Where showing it fails, too, the rest is not fetched.
-        try { go = sink(offset, value); } finally { if (go === false) await reader.cancel(); }
+        try { go = sink(offset, value); } finally {
+            // A connection that breaks now harms nothing.
+            if (go === false) await reader.cancel().catch(() => {});
+        }
         offset += value.length;
         if (go === false) return offset;
     }
@@ -175,7 +178,7 @@ export async function loadUrl(wasm, url, show, signal) {
     if (!start) {
         if (first.status !== 206) return body(first);
         // Another site need not tell how long the file is, and a part of unknown length is no file.
-        await first.body?.cancel();
+        await first.body?.cancel().catch(() => {});
         return body(null);
     }
     const total = sizeOf(first);

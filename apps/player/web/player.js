@@ -11,15 +11,11 @@
 import init, * as wasm from "./cc4dgs_player.js";
 import { bytesOf, checkSize, loadUrl, nameOf } from "./loading.js";
 import { addGestures, addKeys, commandsOf } from "./gestures.js";
-import { WebGl } from "./webgl.js";
+import { capture, dispose, isLost, recover, release, startDevice } from "./device.js";
 import { build, followLink, linkOf, remember, restore, savePng } from "./controls.js";
 
 // What exports need of a page: raise it together with PAGE_VERSION in exporters/src/web/page.rs where archives need a newer one.
-export const PAGE_VERSION = 3;
-
-// A lost device is replaced at most so often in a row; it is none of the row once it has been kept for so many milliseconds.
-const MOST_RECOVERIES = 3;
-const KEPT_MS = 60000;
+export const PAGE_VERSION = 4;
 
 // An address as text; other sources as they are.
 const addressed = source => (source instanceof URL ? source.href : source);
@@ -34,20 +30,20 @@ export async function createPlayer(container, options = {}) {
     const player = new Page(container, backend);
     player.own = addressed(src);
     const view = options.remember === false ? null : restore(player);
+    // Where there is no model, the link is for the file that is opened first.
+    if (!src && location.hash) player.linked = {};
     try {
-        // Another player may have it where this one could not fetch it.
+        // Where this player cannot fetch the module, the next one tries again.
         ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined).catch(e => {
             ready = undefined;
             throw new Error(`The player's module cc4dgs_player_bg.wasm could not be loaded (${e.message}). Reload the page; on a server of your own, put the file beside player.js.`);
         });
-        await ready;
-        await player.start();
+        await player.start(ready);
         const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
         const first = { playing: autoplay, ...view };
-        if (src) await player.load(src, options.name, { ...first, playing: first.playing && !still });
-        else followLink(player);
-        // Where there is no model, the link is for the file that is opened first.
-        if (!src && location.hash) player.linked = {};
+        if (!src) followLink(player);
+        // A file that was opened while the module was loaded stays.
+        else if (!player.abort) await player.load(src, options.name, { ...first, playing: first.playing && !still });
     } catch (e) {
         player.fail(e);
     }
@@ -71,12 +67,14 @@ class Page {
         this.ui = build(container, this);
     }
     get destroyed() { return this.life.signal.aborted; }
-    /// `starting` is the promise of it.
-    start() { return this.starting = this.begin(); }
-    async begin() {
-        await this.startDevice();
+    /// Starts on a graphics device once `module` is there. `starting` is the promise of it.
+    start(module) { return this.starting = this.begin(module); }
+    async begin(module) {
+        await module;
+        if (this.destroyed) throw gone();
+        await startDevice(this);
         // Meanwhile it may have ended.
-        if (this.destroyed) { this.release(); throw gone(); }
+        if (this.destroyed) { release(this); throw gone(); }
         this.apply();
         const act = {
             mode: () => (this.flying ? "fly" : "orbit"),
@@ -98,32 +96,6 @@ class Page {
             this.request = requestAnimationFrame(now => this.loop(now));
         }
         this.resize();
-    }
-    // WebGPU where there is an adapter, else WebGL2. A canvas keeps the interface that it had first: WebGL2 stays on its own, and takes a new one after WebGPU.
-    async startDevice() {
-        const forced = this.backend === "webgl" || this.gl;
-        if (!forced && await navigator.gpu?.requestAdapter()) {
-            this.isWebGpus = true;
-            try {
-                this.gpu = await wasm.Player.create(this.ui.canvas);
-                return;
-            } catch (e) {
-                // An adapter without the device that is needed.
-                console.warn(`WebGPU: ${e.message}`);
-            }
-        }
-        if (this.isWebGpus) {
-            this.isWebGpus = false;
-            this.ui.replaceCanvas();
-        }
-        // A lost context stays that of its canvas until the browser restores it.
-        if (this.gl?.gl.isContextLost()) {
-            const late = () => this.fail(new Error("The graphics device was lost, and the browser has not given WebGL2 back yet. Wait, or reload the page."));
-            if (await this.gl.restored(late, this.life.signal)) this.ui.error(null);
-        }
-        this.gl?.free();
-        this.gl = new WebGl(this.ui.canvas, () => { this.dirty = true; });
-        this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height, this.gl.mostWords, this.gl.mostSide);
     }
     // Events
     on(name, listener) { (this.listeners[name] ??= new Set()).add(listener); return () => this.listeners[name].delete(listener); }
@@ -161,28 +133,30 @@ class Page {
         };
         [this.source, this.name, this.first] = [source, name, first];
         this.ui.loading(true);
+        // Reading bytes is not interrupted, and a listener may load another model, or destroy the player: what arrives from then on is not shown.
+        const current = () => { if (signal.aborted) throw signal.reason; };
         const show = {
-            poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
+            poster: bytes => { current(); if (bytes && !this.facts) this.ui.poster(bytes); },
             part: (download, layer, motion, degree, starts) => {
+                current();
                 // A download that begins anew goes on with pose and time.
                 const anew = starts && !before;
                 if (anew) begin();
                 this.loaded(JSON.parse(this.gpu.openPart(download, layer, motion, degree, anew)), anew, anew && played);
             },
-            harmonics: (download, degree) => { this.gpu.openHarmonics(download, degree); this.gl?.loadHarmonics(this.gpu); this.draw(); },
+            harmonics: (download, degree) => { current(); this.gpu.openHarmonics(download, degree); this.gl?.loadHarmonics(this.gpu); this.draw(); },
             whole: (name, bytes) => {
-                // A later load has the page; reading bytes is not interrupted.
-                if (signal.aborted) throw signal.reason;
+                current();
                 begin();
                 this.loaded(JSON.parse(this.gpu.open(name, bytes)), true, played);
             },
-            progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
+            progress: (share, bytes) => { current(); this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
         try {
-            // A lost device is being replaced: its model gives way to this one.
-            if (!this.gpu) await this.starting?.catch(() => {});
+            // The module is being loaded, or a lost device replaced, whose model gives way to this one.
+            const problem = this.gpu ? null : await this.starting?.then(() => null, e => e);
             if (signal.aborted) return null;
-            if (!this.gpu) throw new Error("There is no graphics device to show it with. Reload the page, or open the file with `cc4dgs view`.");
+            if (!this.gpu) throw problem ?? new Error("There is no graphics device to show it with. Reload the page, or open the file with `cc4dgs view`.");
             if (!again) this.facts = null;
             if (typeof source === "string") {
                 this.ui.title(name ?? nameOf(source));
@@ -209,7 +183,7 @@ class Page {
                 this.gpu = null;
                 e = new Error(`The player stopped while it opened ${this.title()} (${e.message}), most likely because its memory ran out. Reload the page, or open the file with \`cc4dgs view\`.`);
             } else if (signal.aborted) return null;
-            // What is shown of it stays as it is. A model before is still there, if only in part where it was arriving or has made room.
+            // What is shown of it stays as it is. A model before is still there, if only in part where it was arriving or its memory was given to this one.
             if (this.shown?.source === source) this.shown.ended = true;
             const { ended, ...shown } = this.shown ?? { source: null, facts: null, first: null };
             Object.assign(this, shown);
@@ -319,8 +293,9 @@ class Page {
     draw() { if (this.gl) { if (this.gpu && !this.gl.lost) this.gl.draw(this.gpu); } else this.gpu?.draw(); this.dirty = false; this.drawn = (this.drawn ?? 0) + 1; }
     loop(now) {
         try { this.advance(now); } catch (e) {
-            // Nothing that would draw can be relied on any more.
+            // Nothing that would draw can be relied on any more. After a panic nothing of it can be called.
             console.error(e);
+            if (!(e instanceof WebAssembly.RuntimeError)) dispose(this.gpu);
             this.gpu = null;
             this.fail(new Error(`The player has stopped (${e.message}). Reload the page.`));
             return;
@@ -331,7 +306,7 @@ class Page {
     advance(now) {
         const elapsed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
         this.last = now;
-        if (this.gpu && (this.gl ? this.gl.lost : this.gpu.lost)) this.recover();
+        if (this.gpu && isLost(this)) recover(this);
         else if (this.gpu) {
             // A window that moves to another screen keeps its size in CSS pixels, which is all that an observer sees.
             if (this.ratio !== window.devicePixelRatio) this.resize();
@@ -343,7 +318,7 @@ class Page {
             this.statistics(now);
             const failure = this.gpu?.takeFailure();
             // Others follow from the first.
-            if (failure && !this.failure) this.fail(new Error(this.failure = `The graphics device failed (${failure}), most likely because its memory has no room for this model. Open a smaller one, or this one with \`cc4dgs view\`.`));
+            if (failure && !this.failure) this.fail(new Error(this.failure = `The graphics device failed (${failure}), most likely because it has too little free memory for this model. Open a smaller one, or this one with \`cc4dgs view\`.`));
         }
     }
     statistics(now) {
@@ -355,41 +330,6 @@ class Page {
             (this.gl ? Promise.resolve(this.gl.visible) : this.gpu.countVisible()).then(visible => this.ui.statistics({ ...facts, rate, visible, received: this.received, adapter: this.gl?.name ?? this.gpu?.adapter }));
         }
     }
-    // A lost device: a new one, and the same model at the same time and pose.
-    async recover() {
-        const [old, source, name] = [this.gpu, this.source, this.name];
-        // A model that nobody has seen yet starts as it would have.
-        const first = this.shown?.source === source ? this.now : this.first;
-        this.gpu = null;
-        // What is still being loaded has nothing to go to; it begins anew.
-        this.abort?.abort();
-        const { abort } = this;
-        const losses = this.losses = performance.now() - (this.keptSince ?? -Infinity) < KEPT_MS ? this.losses + 1 : 1;
-        this.keptSince = Infinity;
-        try {
-            [this.facts, this.shown] = [null, null];
-            old.free();
-            if (losses > MOST_RECOVERIES) throw new Error(`The graphics device was lost ${losses} times in a row, most likely because the model is too large for it. Reload the page with another model, or open this one with \`cc4dgs view\`.`);
-            await this.start();
-            // Unless another model was opened meanwhile.
-            if (source && this.abort === abort) await this.load(source, name, first);
-            this.emit("recovered", {});
-        } catch (e) {
-            if (!this.gpu) this.ui.empty();
-            this.fail(e);
-        } finally {
-            // A device that was lost meanwhile has a recovery of its own.
-            if (this.losses === losses) this.keptSince = performance.now();
-        }
-    }
-    /// Gives device and model back.
-    release() {
-        const { gpu, gl } = this;
-        [this.gpu, this.gl] = [null, null];
-        gl?.destroy();
-        // A panic leaves it borrowed.
-        try { gpu?.loseDevice(); gpu?.free(); } catch (e) { console.warn(e); }
-    }
     /// Ends the player and empties its element. `load` and `capture` reject from then on, other calls do nothing.
     destroy() {
         if (this.destroyed) return;
@@ -399,25 +339,13 @@ class Page {
         this.sizes?.disconnect();
         Object.values(this.listeners).forEach(listeners => listeners.clear());
         [this.source, this.facts, this.shown, this.first] = [null, null, null, null];
-        this.release();
+        release(this);
         this.ui.remove();
     }
     // Images and links
     async capture(camera, time) {
         if (this.destroyed) throw gone();
-        const none = () => new Error("There is no graphics device to draw an image with. Wait for \"recovered\", or reload the page.");
-        if (!this.gpu || this.gl?.lost) throw none();
-        const json = camera ? JSON.stringify(camera) : undefined;
-        if (this.gl) {
-            const image = this.gl.capture(this.gpu, json, time);
-            // A context that was lost meanwhile reports no error: the pixels are zeros.
-            if (this.gl.lost) throw none();
-            return image;
-        }
-        const image = await this.gpu.capture(json, time);
-        const out = { width: image.width, height: image.height, data: image.rgba };
-        image.free();
-        return out;
+        return capture(this, camera, time);
     }
     async savePng() {
         if (!this.drawnFacts || !this.gpu) return;

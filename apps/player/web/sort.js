@@ -39,12 +39,12 @@ export function sortByDepth(model, view) {
 }
 
 /// What sorting needs of a model: the centres, and starts and coefficients of their tracks alone. `gaussians` has 16 floats each, `starts` and `coefficients` hold all
-/// heads; `places` has, per segment, where starts and coefficients of the centres begin (both all ones: they do not move). `track` in `tracks` is found by the first start.
-export function sortable(gaussians, starts, coefficients, places, moving) {
+/// heads; `offsets` has, per segment, where starts and coefficients of the centres begin (both all ones: they do not move). `track` in `tracks` is found by the first start.
+export function sortable(gaussians, starts, coefficients, offsets, moving) {
     const means = new Float32Array(3 * gaussians.length / 16);
     for (let i = 0, at = 0; at < means.length; i += 16, at += 3) [means[at], means[at + 1], means[at + 2]] = [gaussians[i], gaussians[i + 1], gaussians[i + 2]];
     const own = [];
-    for (let k = 0; k < places.length; k += 2) if (places[k] !== 0xffffffff) own.push([places[k], places[k + 1]]);
+    for (let k = 0; k < offsets.length; k += 2) if (offsets[k] !== 0xffffffff) own.push([offsets[k], offsets[k + 1]]);
     const length = own.reduce((sum, [start]) => sum + starts[start + moving], 0);
     const out = { means, moving, starts: new Uint32Array(own.length * (moving + 1)), coefficients: new Float32Array(3 * length) };
     const tracks = new Map();

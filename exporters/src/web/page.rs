@@ -4,16 +4,28 @@ use cc4dgs_format::installed::{program_folder, user_data_folder, variable_path};
 use cc4dgs_format::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Names the folder of the page; nothing else is looked at then.
+/// Variable that names the folder of the page; if it is set, no other path is searched.
 pub const PAGE_VARIABLE: &str = "CC4DGS_PAGE";
 /// Name of the folder where the variable does not state one.
 const PAGE_FOLDER: &str = "page";
 /// Files of the page that `apps/player/build-web` makes; `index.html` is written anew.
-pub const PAGE_FILES: [&str; 9] =
-    ["player.js", "controls.js", "gestures.js", "loading.js", "sort.js", "webgl.js", "player.css", "cc4dgs_player.js", "cc4dgs_player_bg.wasm"];
-/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights, version 3 draws with the blur of the model.
-pub const PAGE_VERSION: u32 = 3;
-/// Largest file that is taken for one of them, in bytes.
+pub const PAGE_FILES: [&str; 11] = [
+    "player.js",
+    "controls.js",
+    "device.js",
+    "gestures.js",
+    "loading.js",
+    "shaders.js",
+    "sort.js",
+    "webgl.js",
+    "player.css",
+    "cc4dgs_player.js",
+    "cc4dgs_player_bg.wasm",
+];
+/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights, version 3 draws with the blur of the model,
+/// and version 4 has `device.js` and `shaders.js`.
+pub const PAGE_VERSION: u32 = 4;
+/// Upper bound on the size of a file of the page, in bytes.
 const MOST_BYTES: u64 = 64 << 20;
 
 /// The page: its files by name, in the order of [`PAGE_FILES`].
@@ -25,8 +37,8 @@ pub struct Page {
     pub origin: String,
 }
 
-/// The folders that [`Page::find`] looks at, in order: the one that the variable `CC4DGS_PAGE` names, or else `page` in [`user_data_folder`], `share/cc4dgs/page`
-/// beside the folder of the program, and `page` in it.
+/// The folders that [`Page::find`] searches, in order: the one that the variable `CC4DGS_PAGE` names, or else `page` in [`user_data_folder`],
+/// `share/cc4dgs/page` beside the folder of the program, and `page` in it.
 pub fn page_paths() -> Vec<PathBuf> {
     if let Some(folder) = variable_path(PAGE_VARIABLE) {
         return vec![folder];
@@ -68,7 +80,13 @@ impl Page {
             }
             Ok((name, std::fs::read(&path).map_err(|e| Error::io(&path, e))?))
         };
-        Self { files: PAGE_FILES.into_iter().map(read).collect::<Result<_>>()?, origin: folder.display().to_string() }.checked()
+        let mut page = Self { files: Vec::with_capacity(PAGE_FILES.len()), origin: folder.display().to_string() };
+        for name in PAGE_FILES {
+            page.files.push(read(name)?);
+            // The version comes first: an older page lacks files.
+            page = page.checked()?;
+        }
+        Ok(page)
     }
     /// The page, where it has the version that is needed.
     fn checked(self) -> Result<Self> {
@@ -100,8 +118,10 @@ fn embedded() -> Option<[Vec<u8>; PAGE_FILES.len()]> {
     Some([
         file!("player.js"),
         file!("controls.js"),
+        file!("device.js"),
         file!("gestures.js"),
         file!("loading.js"),
+        file!("shaders.js"),
         file!("sort.js"),
         file!("webgl.js"),
         file!("player.css"),
@@ -123,8 +143,14 @@ mod tests {
     fn older_pages_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         PAGE_FILES.iter().for_each(|name| std::fs::write(folder.path().join(name), "export const PAGE_VERSION = 1;").unwrap());
-        let message = Page::read(folder.path()).unwrap_err().to_string();
-        assert!(message.contains(&folder.path().display().to_string()) && message.contains("build-web"), "{message}");
+        let refused = || {
+            let message = Page::read(folder.path()).unwrap_err().to_string();
+            assert!(message.contains(&folder.path().display().to_string()) && message.contains("build-web"), "{message}");
+        };
+        refused();
+        std::fs::remove_file(folder.path().join("device.js")).unwrap();
+        refused();
+        std::fs::write(folder.path().join("device.js"), "").unwrap();
         std::fs::write(folder.path().join("player.js"), include_str!("../../../apps/player/web/player.js")).unwrap();
         assert!(Page::read(folder.path()).is_ok());
     }

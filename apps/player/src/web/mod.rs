@@ -275,7 +275,7 @@ impl Player {
     pub fn orbit(&mut self, right: f64, upwards: f64) {
         self.navigator.orbit(right, upwards);
     }
-    /// Turns in place by angles in radians.
+    /// Turns the view around the eye by angles in radians.
     pub fn look(&mut self, right: f64, upwards: f64) {
         self.navigator.look(right, upwards);
     }
@@ -295,7 +295,7 @@ impl Player {
     pub fn reset(&mut self) {
         self.navigator.reset();
     }
-    /// Takes the place of a capture camera.
+    /// Takes the view of a capture camera.
     #[wasm_bindgen(js_name = goTo)]
     pub fn go_to(&mut self, index: usize) {
         if let Some(camera) = self.cameras.get(index) {
