@@ -3,7 +3,7 @@
 use super::bars::{Bars, Strips, swatch};
 use super::pareto::front;
 use super::plot::{Axis, COLOURS, Entry, Plot, Point, Series, marker};
-use super::rows::{Better, CodecFamily, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, Row, SIZE, SSIM, TRAINING};
+use super::rows::{Better, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, RateCurve, Row, SIZE, SSIM, TRAINING};
 use super::text::html;
 use crate::sweep::{CellResult, TrainingDevices};
 use std::collections::{BTreeMap, BTreeSet};
@@ -97,7 +97,7 @@ pub(super) fn files(scene: &str, rows: &[Row], key: &Key, trained: &TrainingDevi
 pub(super) fn figures(rows: &[Row], key: &Key, trained: &TrainingDevices) -> String {
     let plots = |plots: &[Plot]| grid("", plots.iter().map(Plot::figure).collect());
     let Plots { rate, cost, progress } = Plots::of(rows, key, trained);
-    let note = "A point is the mean over seeds, its whisker the least and the largest seed. Lines join the profiles of a codec, and the settings of a method.";
+    let note = "A point is the mean over seeds, its whisker the least and the largest seed. A line joins points of one training that differ in the rate of one codec alone: that of the Gaussians, or that of the deformer's weights. Where a method is stored by one codec, a line joins its settings.";
     let mut out = heading("Rate and distortion", note) + &key.legend();
     out += &plots(&rate);
 
@@ -156,10 +156,13 @@ fn metric_axis(metric: &Quantity) -> Axis {
 }
 
 fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
-    let mut curves: BTreeMap<(&str, CodecFamily), Vec<(usize, Point)>> = BTreeMap::new();
+    let mut curves: BTreeMap<RateCurve, Vec<(usize, Point)>> = BTreeMap::new();
     for row in rows {
-        if let Some(point) = point(row, &SIZE, metric) {
-            curves.entry((row.method, row.codec_family())).or_default().push((key.colour(row), point));
+        let Some(point) = point(row, &SIZE, metric) else { continue };
+        // Settings of a method that is stored in one way are points of a line, too. With several codecs there would be a line for each of them.
+        let one_codec = rows.iter().all(|other| other.method != row.method || other.codec == row.codec);
+        for curve in row.rate_curves().into_iter().chain(one_codec.then(|| row.setting_curve())) {
+            curves.entry(curve).or_default().push((key.colour(row), point.clone()));
         }
     }
     let mut series: Vec<Series> = curves
@@ -196,20 +199,31 @@ fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key, trained: 
     Plot { title: format!("{} against {}", metric.name, cost.name), x: Axis::ranged(cost.title()), y: metric_axis(metric), series, front: best, note }
 }
 
-/// The first row of each training: all its codecs share the training.
-fn trainings<'r, 'a>(rows: &'r [Row<'a>]) -> Vec<&'r Row<'a>> {
-    let mut seen = BTreeSet::new();
-    rows.iter().filter(|row| seen.insert(row.training_key())).collect()
+/// A row per training, with a cell per seed: all codecs share the training, and those of a sweep that is not complete may lack some of its seeds.
+fn trainings<'a>(rows: &[Row<'a>]) -> Vec<Row<'a>> {
+    let mut found: Vec<Row<'a>> = Vec::new();
+    for row in rows {
+        match found.iter_mut().find(|other| other.training_key() == row.training_key()) {
+            Some(other) => {
+                let more = row.cells.iter().filter(|cell| other.cells.iter().all(|known| known.axes.seed != cell.axes.seed));
+                let more: Vec<&'a CellResult> = more.copied().collect();
+                other.cells.extend(more);
+                other.cells.sort_by_key(|cell| cell.axes.seed);
+            }
+            None => found.push(row.clone()),
+        }
+    }
+    found
 }
 
 /// The row of each training with the highest mean PSNR.
 pub fn best_codecs<'r, 'a>(rows: &'r [Row<'a>]) -> Vec<&'r Row<'a>> {
     let psnr = |row: &Row| row.spread(&PSNR).map_or(f64::NEG_INFINITY, |s| s.mean);
-    let best = |first: &'r Row<'a>| {
-        let of_training = rows.iter().filter(|row| row.training_key() == first.training_key());
-        of_training.fold(first, |best, row| if psnr(row) > psnr(best) { row } else { best })
+    let best = |training: Row<'a>| {
+        let of_training = rows.iter().filter(|row| row.training_key() == training.training_key());
+        of_training.reduce(|best, row| if psnr(row) > psnr(best) { row } else { best })
     };
-    trainings(rows).into_iter().map(best).collect()
+    trainings(rows).into_iter().filter_map(best).collect()
 }
 
 fn mean(row: &Row, value: impl Fn(&CellResult) -> f64) -> f64 {
@@ -228,7 +242,7 @@ fn stage_bars(rows: &[Row], trained: &TrainingDevices) -> Bars {
         parts.push(mean(row, |cell| cell.cost.training_seconds - stage_sum(cell)));
         parts
     };
-    let lines = trainings(rows).into_iter().map(|row| (row.training(), values(row))).collect();
+    let lines = trainings(rows).iter().map(|row| (row.training(), values(row))).collect();
     let parts = stages.iter().cloned().chain(["reading, checks, saving".to_string()]).collect();
     Bars { title: "Training by stage, mean over seeds".into(), axis: "wall time (s)".into(), parts, lines, note: device_note(rows, trained) }
 }
@@ -254,7 +268,7 @@ fn storage_bars(rows: &[Row]) -> Bars {
 /// By iteration, or by time where `times` says what the trainings ran on.
 fn training_curves(rows: &[Row], key: &Key, times: Option<&TrainingDevices>) -> Plot {
     let mut series = Vec::new();
-    for row in trainings(rows) {
+    for row in &trainings(rows) {
         for cell in &row.cells {
             let x = |i: usize| if times.is_some() { cell.cost.curve_seconds[i] / 60.0 } else { cell.curve.iteration[i] as f64 };
             let points = cell.curve.psnr_db.iter().enumerate().map(|(i, y)| Point { x: x(i), y: *y, y_range: None, hint: String::new() }).collect();
@@ -273,7 +287,7 @@ fn training_curves(rows: &[Row], key: &Key, times: Option<&TrainingDevices>) -> 
 /// What stands below a plot of validation views where the trainings kept other numbers of views out: their lines are then of other views. Else nothing.
 fn views_note(rows: &[Row]) -> String {
     let kept_out = |cell: &&CellResult| cell.provenance.configuration.pointer("/train/validation").map_or_else(|| "?".to_string(), ToString::to_string);
-    let of = |row: &&Row| -> BTreeSet<String> { row.cells.iter().filter(|cell| !cell.validation_curve.psnr_db.is_empty()).map(kept_out).collect() };
+    let of = |row: &Row| -> BTreeSet<String> { row.cells.iter().filter(|cell| !cell.validation_curve.psnr_db.is_empty()).map(kept_out).collect() };
     let counts: Vec<(String, BTreeSet<String>)> = trainings(rows).iter().map(|row| (row.training(), of(row))).filter(|(_, own)| !own.is_empty()).collect();
     if counts.iter().flat_map(|(_, own)| own).collect::<BTreeSet<_>>().len() < 2 {
         return String::new();
@@ -288,7 +302,7 @@ fn validation_curves(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Plot
         let columns = cell.cost.validation_seconds.iter().zip(&cell.validation_curve.psnr_db);
         columns.map(|(seconds, psnr)| Point { x: seconds / 60.0, y: *psnr, y_range: None, hint: String::new() }).collect()
     };
-    let of = |row: &&Row| row.cells.iter().map(|cell| Series { colour: key.colour(row), marker: None, line: true, points: line(cell) }).collect::<Vec<_>>();
+    let of = |row: &Row| row.cells.iter().map(|cell| Series { colour: key.colour(row), marker: None, line: true, points: line(cell) }).collect::<Vec<_>>();
     Plot {
         title: "Validation views by time, a line per seed".into(),
         x: Axis::linear("wall time (min)"),

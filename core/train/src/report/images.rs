@@ -124,17 +124,22 @@ fn crop(image: &Image8, (left, top, side): Square) -> Image8 {
     Image8 { width: side, height: side, channels: 3, data: (0..side).flat_map(row).copied().collect() }
 }
 
+/// Where squares of `side` pixels begin along `length` pixels, half a side apart. The last one ends at the edge.
+fn offsets(length: u32, side: u32) -> impl Iterator<Item = u32> {
+    let last = length.saturating_sub(side);
+    (0..last).step_by((side / 2).max(1) as usize).chain([last])
+}
+
 /// Where the renders together differ most from the truth.
 fn worst_square(truth: &Image8, renders: &[Image8]) -> Square {
     let side = (truth.width / 6).clamp(16, 96).min(truth.width).min(truth.height);
-    let step = (side / 2).max(1);
     let error = |left: u32, top: u32| -> u64 {
         let squares = renders.iter().map(|render| (crop(render, (left, top, side)), crop(truth, (left, top, side))));
         squares.map(|(a, b)| a.data.iter().zip(&b.data).map(|(x, y)| u64::from(x.abs_diff(*y))).sum::<u64>()).sum()
     };
     let mut best = ((0, 0, side), 0);
-    for top in (0..=truth.height - side).step_by(step as usize) {
-        for left in (0..=truth.width - side).step_by(step as usize) {
+    for top in offsets(truth.height, side) {
+        for left in offsets(truth.width, side) {
             let error = error(left, top);
             if error > best.1 {
                 best = ((left, top, side), error);
@@ -250,4 +255,22 @@ fn flicker(folder: &Path, shown: &[(&Row, &CellResult)]) -> Result<String> {
 pub fn built_in<'a>(scenes: &BTreeMap<&'a str, Vec<Row<'a>>>) -> BTreeSet<&'a str> {
     let made = |cell: &CellResult| cell.provenance.data.files == 0 && crate::data::procedural::name_of(Path::new(&cell.provenance.data.path)).is_some();
     scenes.iter().filter(|(_, rows)| rows.iter().flat_map(|r| &r.cells).all(|cell| made(cell))).map(|(scene, _)| *scene).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn squares_reach_every_edge() {
+        assert_eq!(offsets(100, 16).last(), Some(84));
+        assert_eq!((offsets(16, 16).collect::<Vec<_>>(), offsets(32, 16).collect::<Vec<_>>()), (vec![0], vec![0, 8, 16]));
+        // Only the last rows and columns are wrong, which no multiple of half a side shows.
+        let (width, height) = (100u32, 60u32);
+        let image = |corner: u8| {
+            let shade = |i: u32| if i % width >= 98 && i / width >= 58 { corner } else { 9 };
+            Image8 { width, height, channels: 3, data: (0..width * height).flat_map(|i| [shade(i); 3]).collect() }
+        };
+        assert_eq!(worst_square(&image(9), &[image(200)]), (84, 44, 16));
+    }
 }

@@ -124,9 +124,14 @@ impl Scale {
     }
     /// Ticks with their labels.
     pub(super) fn ticks(&self) -> Vec<(f64, String)> {
+        let power = |v: f64| v.abs().log10().floor();
         let label = |v: f64, step: f64| {
-            let plain = v == 0.0 || (1e-4..1e6).contains(&v.abs());
-            if plain { short(v, (-step.abs().log10().floor()).clamp(0.0, 6.0) as usize) } else { format!("{v:e}") }
+            if v == 0.0 || (1e-4..1e6).contains(&v.abs()) {
+                return short(v, (-power(step)).clamp(0.0, 6.0) as usize);
+            }
+            // No more digits than the step has: its multiples are rounded.
+            let digits = (power(v) - power(step)).clamp(0.0, 15.0) as usize;
+            format!("{v:.digits$e}")
         };
         if !self.log {
             let step = nice_step((self.high - self.low) / 5.0);
@@ -143,7 +148,7 @@ impl Scale {
             let every = values.len().div_ceil(7);
             values = values.into_iter().step_by(every).collect();
         }
-        values.into_iter().map(|v| (v, label(v, 10f64.powf(v.log10().floor())))).collect()
+        values.into_iter().map(|v| (v, label(v, 10f64.powf(power(v))))).collect()
     }
 }
 
@@ -353,6 +358,13 @@ mod tests {
                 assert!(ticks.windows(2).all(|w| w[0].1 != w[1].1), "{values:?}: {ticks:?}");
             }
         }
+    }
+
+    #[test]
+    fn labels_have_the_digits_of_their_step() {
+        let labels = |high: f64| Scale::new([0.0, high].into_iter(), false, 0.0, 1.0).ticks().into_iter().map(|(_, label)| label).collect::<Vec<_>>();
+        assert_eq!(labels(9e-5), ["0", "2e-5", "4e-5", "6e-5", "8e-5"]);
+        assert_eq!(labels(1.2e6), ["0", "500000", "1.0e6"]);
     }
 
     #[test]

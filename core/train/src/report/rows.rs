@@ -77,8 +77,40 @@ impl Quantity {
     }
 }
 
-/// A codec without its profile, and what was set beside the profile.
-pub type CodecFamily<'a> = (&'a str, String);
+/// A codec at one rate, or at all of its rates.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Rates<'a> {
+    /// `NAME[:PROFILE]`.
+    One(&'a str),
+    /// The name, and the key that states the rate (`max-drop` of `compact:max-drop=0.05dB`); empty for profiles with a name alone.
+    All(&'a str, &'a str),
+}
+
+impl<'a> Rates<'a> {
+    /// All rates of `codec` (`NAME[:PROFILE]`). Only numbers are rates: a codec with another value in its profile is joined with no other.
+    fn all(codec: &'a str) -> Self {
+        let (name, profile) = codec.split_once(':').unwrap_or((codec, ""));
+        match profile.split_once('=') {
+            None => Self::All(name, ""),
+            Some((key, value)) if value.starts_with(|c: char| c.is_ascii_digit() || c == '.') => Self::All(name, key),
+            Some(_) => Self::All(codec, ""),
+        }
+    }
+}
+
+/// What the points of one line of rate and distortion have in common: everything but the rate of one codec, or but the setting.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct RateCurve<'a> {
+    method: &'a str,
+    /// None where the line joins settings.
+    setting: Option<&'a str>,
+    /// The codec of the Gaussians.
+    gaussians: Rates<'a>,
+    /// What was set beside its profile.
+    settings: String,
+    /// The weight codec.
+    weights: Rates<'a>,
+}
 
 /// The results that differ in their seed alone.
 #[derive(Clone, Debug)]
@@ -109,10 +141,19 @@ impl<'a> Row<'a> {
     pub fn name(&self) -> String {
         format!("{} / {}", self.training(), self.codec)
     }
-    /// The profiles of one codec are one family. The grid's name of it may be anything.
-    pub fn codec_family(&self) -> CodecFamily<'a> {
+    /// The lines that this row may be a point of: along the rate of the codec of its Gaussians, and along that of its weight codec. The grid's name of the
+    /// codec may be anything.
+    pub(super) fn rate_curves(&self) -> [RateCurve<'a>; 2] {
         let choice = &self.cells[0].provenance.codec;
-        (choice.codec.split(':').next().unwrap_or(&choice.codec), choice.settings.to_string())
+        let curve =
+            |gaussians, weights| RateCurve { method: self.method, setting: Some(self.setting), gaussians, settings: choice.settings.to_string(), weights };
+        [curve(Rates::all(&choice.codec), Rates::One(&choice.field_weights)), curve(Rates::One(&choice.codec), Rates::all(&choice.field_weights))]
+    }
+    /// The line along the settings of the method, such as sizes of its deformer, stored as this row is.
+    pub(super) fn setting_curve(&self) -> RateCurve<'a> {
+        let choice = &self.cells[0].provenance.codec;
+        let (gaussians, weights) = (Rates::One(&choice.codec), Rates::One(&choice.field_weights));
+        RateCurve { method: self.method, setting: None, gaussians, settings: choice.settings.to_string(), weights }
     }
     /// The rows that share a training with this one have equal keys.
     pub fn training_key(&self) -> (&'a str, &'a str) {

@@ -38,8 +38,8 @@ pub struct Table {
 }
 
 /// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds. The best mean of a column is marked
-/// where there are several of trainings that did not fail; those that did are never the best. Times of trainings that ran on different devices state these, and
-/// none is the best. Notes state why values of these quantities are missing, every reason once.
+/// where means of trainings that did not fail differ in the digits shown; trainings that failed are never the best. Times of trainings that ran on different
+/// devices state these, and none is the best. Notes state why values of these quantities are missing, every reason once.
 pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], trained: &TrainingDevices) -> Table {
     let settings = rows.iter().any(|row| row.setting != "base");
     let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
@@ -79,7 +79,8 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
         let rounded = |mean: f64| format!("{mean:.*}", quantity.digits);
         let mixed = quantity.key == TRAINING.key && trained.differ();
         let means: Vec<f64> = spreads.iter().zip(rows).filter(|(_, row)| !row.hopeless()).filter_map(|(spread, _)| spread.map(|s| s.mean)).collect();
-        let best = if means.len() > 1 && !mixed { best(quantity, means.into_iter()).map(rounded) } else { None };
+        let differ = means.iter().map(|mean| rounded(*mean)).collect::<BTreeSet<_>>().len() > 1;
+        let best = if differ && !mixed { best(quantity, means.into_iter()).map(rounded) } else { None };
         if mixed {
             notes.push(trained.sentence());
         }
@@ -163,7 +164,12 @@ impl Table {
     pub fn latex(&self) -> String {
         let columns: String = (0..self.head.len()).map(|i| if self.text_columns.contains(&i) { 'l' } else { 'r' }).collect();
         let mut out = format!("\\begin{{table}}\n\\centering\n\\caption{{{}}}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n", text::latex(&self.title));
-        let line = |cells: &mut dyn Iterator<Item = String>| cells.collect::<Vec<_>>().join(" & ") + " \\\\\n";
+        let line = |cells: &mut dyn Iterator<Item = String>| {
+            let row = cells.collect::<Vec<_>>().join(" & ");
+            // The end of the row before would take these as its arguments.
+            let guard = if row.starts_with(['[', '*']) { "{}" } else { "" };
+            format!("{guard}{row} \\\\\n")
+        };
         out += &line(&mut self.head.iter().map(|name| text::latex(name)));
         out += "\\hline\n";
         for row in &self.rows {
@@ -210,6 +216,13 @@ mod tests {
     use super::super::rows::{LPIPS, PSNR, rows};
     use super::*;
     use crate::sweep::CellResult;
+
+    #[test]
+    fn rows_of_latex_are_no_arguments_of_the_row_before() {
+        let rows = ["[1] a", "*", "b"].map(|text| vec![Cell::plain(text.into())]).to_vec();
+        let table = Table { title: "t".into(), head: vec!["h".into()], text_columns: vec![0], rows, notes: Vec::new() };
+        assert!(table.latex().contains("\nh \\\\\n\\hline\n{}[1] a \\\\\n{}* \\\\\nb \\\\\n\\hline"), "{}", table.latex());
+    }
 
     #[test]
     fn reasons_are_those_of_the_columns_and_all_of_them() {

@@ -3,6 +3,8 @@ use crate::sweep::{CellResult, ImageResult, Outcome, PlannedCell, Spread, exampl
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+mod grouping;
+
 const EVIL: &str = "<script>alert(1)</script>&\"'|`$x_1$\u{202e}";
 
 /// The example of the documentation, changed.
@@ -258,24 +260,6 @@ fn a_report_replaces_reports_only() {
 }
 
 #[test]
-fn profiles_of_a_codec_are_joined_to_a_curve() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut cells = sweep(folder.path());
-    // Lines of the plot of PSNR against size.
-    let lines = |cells: &[CellResult]| {
-        let scenes = rows(cells).unwrap();
-        let figures = charts::figures(&scenes["tiny"], &charts::Key::of(scenes.values().flatten()), &TrainingDevices::of(cells));
-        figures.split("Rate and distortion: PSNR").nth(2).unwrap().split("</svg>").next().unwrap().matches("class=\"line\"").count()
-    };
-    assert_eq!(lines(&cells), 2, "one per method");
-    let mut other = cells.clone();
-    other.iter_mut().filter(|c| c.axes.codec == "cca-low").for_each(|c| _ = c.provenance.codec.settings.insert("codebook".into(), 64.into()));
-    assert_eq!(lines(&other), 0, "a setting beside the profile is no point of its curve");
-    cells.iter_mut().filter(|c| c.axes.codec == "cca-low").for_each(|c| c.provenance.codec.codec = "vq:low".into());
-    assert_eq!(lines(&cells), 0, "two codecs");
-}
-
-#[test]
 fn images_are_shown_where_they_may_be_and_flicker_is_measured() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());
@@ -362,6 +346,7 @@ fn what_does_not_belong_together_is_refused() {
     };
     assert!(refused(&|cells| cells[0].provenance.device.threads = 9).contains("two devices"));
     assert!(refused(&|cells| cells[1].axes.seed = 0).contains("two results"));
+    assert!(refused(&|cells| cells[1].provenance.codec.field_weights = "int8".into()).contains("two codecs called 'cca-default'"));
     assert!(refused(&|cells| cells[0].metrics.get_mut("psnr_db").unwrap().value = 1e300).contains("1e300"));
     let flat = cc4dgs_core::Image8 { width: 32, height: 24, channels: 3, data: vec![7; 32 * 24 * 3] };
     crate::images::write_png(outer.path().join("private.png"), &flat).unwrap();

@@ -1,7 +1,7 @@
 //! Reading results back, and refusing to compare what cannot be compared.
 
 use super::lines::{PATCH, read_lines};
-use super::result::{CellResult, KIND};
+use super::result::{CellResult, CodecChoice, KIND};
 use cc4dgs_core::{Error, Result, plural};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
@@ -81,7 +81,8 @@ fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
 }
 
 /// Refuses results that do not belong into one table: computed on different devices, scored on different sides of the split, by different protocols of a metric,
-/// or, within a scene, on different data, image sizes or images. Those that were trained on different devices are marked in tables instead.
+/// or, within a scene, on different data, image sizes or images; and results that differ in their seed alone by their axes, but were stored by different codecs.
+/// Those that were trained on different devices are marked in tables instead.
 ///
 /// # Errors
 /// [`Error::Data`] that names two of the results and what differs.
@@ -91,6 +92,7 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
     let mut of_metric: BTreeMap<&str, &CellResult> = BTreeMap::new();
     let mut of_scene: BTreeMap<(&str, &str), &CellResult> = BTreeMap::new();
     let mut data: BTreeMap<&str, &CellResult> = BTreeMap::new();
+    let mut of_row: BTreeMap<[&str; 4], &CellResult> = BTreeMap::new();
     for result in results {
         let (a, b) = (&first.provenance.device, &result.provenance.device);
         if a != b {
@@ -98,6 +100,12 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
         }
         if first.split != result.split {
             return Err(mixed("sides of the split", first, &format!("{:?}", first.split), result, &format!("{:?}", result.split)));
+        }
+        let axes = &result.axes;
+        let same_row = *of_row.entry([&axes.scene, &axes.method, &axes.setting, &axes.codec]).or_insert(result);
+        let (a, b) = (&same_row.provenance.codec, &result.provenance.codec);
+        if a != b {
+            return Err(mixed(&format!("codecs called '{}'", axes.codec), same_row, &stored_by(a), result, &stored_by(b)));
         }
         let same_scene = *data.entry(&result.axes.scene).or_insert(result);
         let (a, b) = (&same_scene.provenance.data, &result.provenance.data);
@@ -138,6 +146,12 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
 /// Camera and frame of each scored image.
 fn images(result: &CellResult) -> Vec<(&str, usize)> {
     result.images.iter().map(|image| (image.camera.as_str(), image.frame)).collect()
+}
+
+/// A codec with its settings in words.
+fn stored_by(choice: &CodecChoice) -> String {
+    let settings: String = choice.settings.to_string().lines().map(|line| format!(", {line}")).collect();
+    format!("{} with weights {}{settings}", choice.codec, choice.field_weights)
 }
 
 /// A device in words.
@@ -255,6 +269,9 @@ pub(super) mod tests {
         assert!(refused(&|r| r.provenance.device.threads = 8).contains("8 threads"));
         let error = refused(&|r| _ = r.metrics.get_mut("psnr_db").unwrap().protocol.insert("rounding".into(), "float".into()));
         assert!(error.contains("protocols of psnr_db") && error.contains("rounding = \"eight-bit\"") && error.contains("rounding = \"float\""), "{error}");
+        let error = refused(&|r| _ = r.provenance.codec.settings.insert("finetune".into(), 0.into()));
+        assert!(error.contains("two codecs called 'cca'") && error.contains("cca:default with weights fp16, finetune = 0 in other"), "{error}");
+        check_comparable(&[example(), cell("other", |r| (r.axes.codec, r.provenance.codec.codec) = ("low".into(), "cca:low".into()))]).unwrap();
         assert!(refused(&|r| r.split = cc4dgs_core::Split::Validation).contains("split"));
         assert!(refused(&|r| r.provenance.data.hash = "0".into()).contains("data"));
         assert!(refused(&|r| r.image_size = [200, 200]).contains("200x200"));
