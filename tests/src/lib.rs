@@ -19,7 +19,7 @@ pub fn devices() -> Vec<(&'static str, Device)> {
     devices
 }
 
-/// The larger of two numbers. One that is no number stays, where `f32::max` leaves it out, so that no assertion about the largest of many holds.
+/// The larger of two numbers; NaN if one is NaN, unlike `f32::max`, so that an assertion about the largest of many numbers fails.
 pub fn larger<T: PartialOrd + Copy>(a: T, b: T) -> T {
     if a.partial_cmp(&a).is_none() || a >= b { a } else { b }
 }

@@ -14,8 +14,6 @@ const NEAR_SURFACE: [f64; 2] = [0.7, 1.2];
 const LEAST_OPACITY: f32 = 0.1;
 /// Displacements below this share of the coordinates are rounding errors of bodies that stand still.
 const LEAST_DISPLACEMENT: f64 = 1e-9;
-/// Times at which the pixels that a body covers are collected for cameras that take all frames.
-const MOMENTS: usize = 24;
 
 /// One moving body: a ball, or all parts of a figure.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -31,8 +29,8 @@ pub struct MotionScore {
     /// Root-mean-square distance of their displacements since then from the true ones, over all frames at which they can be seen, as a share of the
     /// true displacement's root-mean-square: 0 follows exactly, 1 is as good as not moving. None without Gaussians or true displacements.
     pub trajectory_error: Option<f64>,
-    /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it covers at one of 24 moments, evenly spread over the sequence, for a
-    /// camera that takes all frames, those of the image's own frame for a moving camera. None where there are none.
+    /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it covers at any frame for a camera that takes all frames, those of the
+    /// image's own frame for a moving camera. None where there are none.
     pub psnr_db: Option<f64>,
 }
 
@@ -138,13 +136,13 @@ fn on_body(scene: &ProceduralScene, body: &Body, time: f64, g: &HostGaussians) -
     (0..g.len()).filter(|row| opacity(g, *row) >= LEAST_OPACITY).filter_map(|row| nearest(row).map(|(_, object)| (row, object))).collect()
 }
 
-/// Per body, the pixels it covers at some moment, or at the frame that the viewpoint takes.
+/// Per body, the pixels it covers at any frame, or at the frame that the viewpoint takes. Traces one ray per pixel and frame, fewer than the images that are
+/// compared need.
 fn covered(scene: &ProceduralScene, viewpoint: &Viewpoint) -> Vec<Vec<bool>> {
     let pixels = (viewpoint.camera.width * viewpoint.camera.height) as usize;
     let mut masks = vec![vec![false; pixels]; scene.bodies.len()];
-    let moments = viewpoint.frame.map_or_else(|| (0..MOMENTS).map(|moment| moment as f64 / MOMENTS as f64).collect(), |frame| vec![scene.time(frame)]);
-    for moment in moments {
-        let seen = scene.tracer(moment).objects_seen(&viewpoint.camera);
+    for frame in viewpoint.frame.map_or(0..scene.frames, |own| own..own + 1) {
+        let seen = scene.tracer(scene.time(frame)).objects_seen(&viewpoint.camera);
         for (mask, body) in masks.iter_mut().zip(&scene.bodies) {
             mask.iter_mut().zip(&seen).for_each(|(m, s)| *m |= s.is_some_and(|object| body.objects.contains(&object)));
         }
@@ -203,6 +201,21 @@ mod tests {
         let masks = covered(&scene, &viewpoint);
         let still = scene.tracer(0.0).objects_seen(&viewpoint.camera).iter().filter(|s| **s == Some(scene.bodies[0].objects.start)).count();
         assert!(masks[0].iter().filter(|m| **m).count() > still, "it moves");
+    }
+
+    #[test]
+    fn masks_cover_fast_bodies_at_every_frame() {
+        let scene = ProceduralScene::named("frequencies").unwrap();
+        let viewpoint = scene.viewpoints().pop().unwrap();
+        let masks = covered(&scene, &viewpoint);
+        // The ball of 16 cycles is at rest, on top, at rest and at the bottom in frames 0 to 3.
+        for frame in 0..4 {
+            let seen = scene.tracer(scene.time(frame)).objects_seen(&viewpoint.camera);
+            for (mask, body) in masks.iter().zip(&scene.bodies) {
+                let outside = mask.iter().zip(&seen).filter(|(m, s)| !**m && **s == Some(body.objects.start)).count();
+                assert_eq!(outside, 0, "{}, frame {frame}", body.name);
+            }
+        }
     }
 
     #[test]

@@ -1,8 +1,12 @@
 //! A small rotation and translation per training camera, learned with everything else.
 //!
-//! Camera c turns by the rotation vector w_c - mean w about its own centre, and its centre moves by t_c - mean t, both in world axes. The means over the training cameras are
-//! zero by construction, so that cameras and model cannot turn or move together, away from the held-out cameras. They could still grow together, which the
-//! regularizer holds back.
+//! Camera c turns by the rotation vector w_c - mean w about its own centre, and its centre moves by t_c - mean t, both in world axes. The average motion of the training
+//! cameras is zero by construction, so that cameras and model cannot turn or move together, away from the held-out cameras. They could still grow together, which
+//! the regularizer holds back.
+//!
+//! The means are over the cameras that were trained on so far: those with a number that is not zero. The coarse stage may draw from the first frame alone, and
+//! `train.time_ramp` lets frames in one after another. With means over all cameras, those that are trained on could move together with the model, against the
+//! others, which Adam would move as fast: it divides the small gradient that a mean hands them by its own size. They have no gradient and stay at zero.
 //!
 //! Rotations are Cayley transforms: with A = \[w\]x, R = I + s (A + A A / 2) where s = 4 / (4 + |w|^2). It is a rotation for every w, by 2 atan(|w| / 2), and its
 //! derivative needs no special case at 0.
@@ -77,6 +81,23 @@ fn moved(camera: &Camera, turn: DVec3, shift: DVec3) -> (Rows, [Rows; 6]) {
     (pose(turned), derivatives)
 }
 
+/// Rotation vector in radians and translation in units of the scene.
+type Numbers = [f64; 6];
+
+/// Whether a camera with these numbers was trained on.
+fn is_trained(numbers: &Numbers) -> bool {
+    numbers.iter().any(|v| *v != 0.0)
+}
+
+/// The factors of all cameras' numbers in the correction of camera `index`: 1 for its own, minus 1/n for each of the n cameras that were trained on, it included.
+fn factors(all: &[Numbers], index: usize) -> Vec<f64> {
+    let counts: Vec<bool> = all.iter().enumerate().map(|(i, numbers)| i == index || is_trained(numbers)).collect();
+    let count = counts.iter().filter(|counts| **counts).count() as f64;
+    // The very first camera would be its own mean and have no gradient.
+    let share = if all.iter().any(is_trained) { 1.0 / count } else { 0.0 };
+    counts.iter().enumerate().map(|(i, counts)| f64::from(u8::from(i == index)) - if *counts { share } else { 0.0 }).collect()
+}
+
 struct Refined {
     settings: Settings,
     context: PosesContext,
@@ -85,10 +106,12 @@ struct Refined {
 }
 
 impl Refined {
-    /// Differences from the mean `[cameras, 3]`: of rotation vectors, or of translations.
-    fn differences(&self, which: usize) -> Tensor<2> {
-        let all = self.parameters[which].value.clone().reshape([self.context.cameras, 3]);
-        all.clone() - all.mean_dim(0)
+    /// The numbers of all cameras `[cameras, 6]`, with gradients, and their values.
+    fn numbers(&self) -> Result<(Tensor<2>, Vec<Numbers>)> {
+        let of = |which: usize| self.parameters[which].value.clone().reshape([self.context.cameras, 3]);
+        let all = Tensor::cat(vec![of(0), of(1)], 1);
+        let values = to_vec(all.clone(), "poses")?;
+        Ok((all, values.chunks_exact(6).map(|row| std::array::from_fn(|k| f64::from(row[k]))).collect()))
     }
 }
 
@@ -102,17 +125,20 @@ impl Poses for Refined {
         if cameras < 2 {
             return Ok(None);
         }
-        let own = Tensor::cat([0, 1].map(|which| self.differences(which).narrow(0, index, 1)).to_vec(), 1);
-        let host = to_vec(own.clone(), "pose")?;
-        let vector = |first: usize| DVec3::from_array([0, 1, 2].map(|k| host.get(first + k).copied().map_or(f64::NAN, f64::from)));
-        let (pose, derivatives) = moved(camera, vector(0), vector(3));
+        let (all, values) = self.numbers()?;
+        let factors = factors(&values, index);
+        let own: Numbers = std::array::from_fn(|k| values.iter().zip(&factors).map(|(numbers, factor)| numbers[k] * factor).sum());
+        let (pose, derivatives) = moved(camera, DVec3::new(own[0], own[1], own[2]), DVec3::new(own[3], own[4], own[5]));
         let mut world_to_camera = camera.world_to_camera;
         for (k, value) in pose.into_iter().enumerate() {
             world_to_camera[k / 4][k % 4] = value;
         }
         // The product with the derivatives has the gradient that the pose has.
         let jacobian: Vec<f32> = derivatives.iter().flat_map(|row| row.iter().copied().chain([0.0; 4])).map(|v| v as f32).collect();
-        let jacobian = Tensor::<2>::from_data(TensorData::new(jacobian, [6, 16]), &own.device());
+        let device = all.device();
+        let jacobian = Tensor::<2>::from_data(TensorData::new(jacobian, [6, 16]), &device);
+        let factors: Vec<f32> = factors.into_iter().map(|v| v as f32).collect();
+        let own = (all * Tensor::<2>::from_data(TensorData::new(factors, [cameras, 1]), &device)).sum_dim(0);
         let probe = (own.reshape([6, 1]) * jacobian).sum_dim(0).reshape([4, 4]);
         Ok(Some(Posed { camera: Camera { world_to_camera, ..camera.clone() }, probe }))
     }
@@ -142,16 +168,20 @@ impl Poses for Refined {
         Ok(Some(ordered_sum(penalties).mul_scalar(2.0 * LINEAR * LINEAR * self.settings.identity / self.context.cameras as f64)))
     }
     fn summary(&self) -> Result<Option<String>> {
-        let lengths = |which: usize| -> Result<(f64, f64)> {
-            let values = to_vec(self.differences(which), &self.parameters[which].name)?;
-            let mut lengths: Vec<f64> = values.chunks_exact(3).map(|v| v.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt()).collect();
-            lengths.sort_unstable_by(f64::total_cmp);
-            Ok((lengths.get(lengths.len() / 2).copied().unwrap_or(0.0), lengths.last().copied().unwrap_or(0.0)))
-        };
         if self.context.cameras < 2 {
             return Ok(Some("a single training camera keeps its pose".into()));
         }
-        let ((turn, most_turn), (shift, most_shift)) = (lengths(0)?, lengths(1)?);
+        let (_, values) = self.numbers()?;
+        let trained = values.iter().filter(|numbers| is_trained(numbers)).count().max(1) as f64;
+        let mean: Numbers = std::array::from_fn(|k| values.iter().map(|numbers| numbers[k]).sum::<f64>() / trained);
+        // Median and largest length of three numbers from `first` on.
+        let lengths = |first: usize| {
+            let length = |numbers: &Numbers| (first..first + 3).map(|k| (numbers[k] - mean[k]).powi(2)).sum::<f64>().sqrt();
+            let mut lengths: Vec<f64> = values.iter().map(|numbers| if is_trained(numbers) { length(numbers) } else { 0.0 }).collect();
+            lengths.sort_unstable_by(f64::total_cmp);
+            (lengths.get(lengths.len() / 2).copied().unwrap_or(0.0), lengths.last().copied().unwrap_or(0.0))
+        };
+        let ((turn, most_turn), (shift, most_shift)) = (lengths(0), lengths(3));
         let [shift, most_shift] = [shift, most_shift].map(|v| 100.0 * v / self.context.extent);
         let (turn, most_turn) = (turn.to_degrees(), most_turn.to_degrees());
         Ok(Some(format!(
@@ -196,6 +226,53 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::Seed;
+
+    /// Gradients of rotations and centres of four cameras, three numbers each, where camera `index` is trained on and every camera has one of `numbers` six times.
+    fn gradients(numbers: [f32; 4], index: usize) -> [Vec<f32>; 2] {
+        let device = Device::flex().autodiff();
+        let context = PosesContext { cameras: 4, extent: 2.0, seed: Seed::root(1) };
+        let mut poses = build(&toml::Table::new(), &context, &device).unwrap();
+        for parameter in poses.parameters_mut() {
+            let values: Vec<f32> = numbers.iter().flat_map(|v| [*v; 3]).collect();
+            parameter.value = Tensor::<1>::from_data(TensorData::new(values, [12]), &device).require_grad();
+        }
+        let world_to_camera = [[1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]];
+        let camera = Camera { name: "c".into(), width: 8, height: 8, fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0, world_to_camera };
+        let probe = poses.corrected(&camera, index).unwrap().unwrap().probe;
+        let upstream: Vec<f32> = (0..16).map(|k| (k as f32).sin()).collect();
+        let of_images = (probe * Tensor::<2>::from_data(TensorData::new(upstream, [4, 4]), &device)).sum();
+        let gradients = (of_images + poses.regularizer().unwrap().unwrap()).backward();
+        [0, 1].map(|which| to_vec(poses.parameters()[which].value.grad(&gradients).unwrap(), "gradient").unwrap())
+    }
+
+    #[test]
+    fn cameras_that_were_not_trained_on_have_no_gradient() {
+        let is_moved = |of: &[Vec<f32>; 2], camera: usize| of.iter().any(|array| array[3 * camera..3 * camera + 3].iter().any(|v| *v != 0.0));
+        // A camera, the numbers before, and whose numbers change.
+        for (index, numbers, expected) in [
+            (1, [0.0; 4], [false, true, false, false]),
+            (1, [0.002, 0.0, 0.0, 0.0], [true, true, false, false]),
+            (0, [0.002, -0.001, 0.0, 0.0], [true, true, false, false]),
+            (2, [0.002, -0.001, 0.001, 0.003], [true; 4]),
+        ] {
+            let found = gradients(numbers, index);
+            assert_eq!([0, 1, 2, 3].map(|camera| is_moved(&found, camera)), expected, "camera {index} of {numbers:?}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn cameras_that_were_trained_on_do_not_move_together() {
+        for (numbers, cameras) in
+            [(vec![[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.0; 6], [0.3, 0.0, 0.1, 0.0, 0.0, 0.2]], vec![0, 2]), (vec![[0.1; 6]; 3], vec![0, 1, 2])]
+        {
+            let of = |index: usize, k: usize| numbers.iter().zip(factors(&numbers, index)).map(|(n, factor)| n[k] * factor).sum::<f64>();
+            for k in 0..6 {
+                assert!(cameras.iter().map(|index| of(*index, k)).sum::<f64>().abs() < 1e-15, "{numbers:?}");
+            }
+        }
+        assert_eq!(factors(&[[0.0; 6], [0.1; 6], [0.2; 6]], 1), [0.0, 0.5, -0.5]);
+    }
 
     #[test]
     fn derivatives_of_poses_are_slopes_at_small_and_large_turns() {

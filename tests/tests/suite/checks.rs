@@ -284,7 +284,7 @@ fn a_run_is_judged_by_the_length_that_it_gets() {
     let (scene, folder) = (builtin("tiny"), tempfile::tempdir().unwrap());
     // 264 iterations of the main stage are planned.
     let sets = [&LEARNS_NOTHING[..], &["train.iterations=330", "train.shares=[1,0,4]", "train.dynamic=none", "train.checkpoint_every=0"]].concat();
-    // What comes of it where there is so much time, and when it was scored.
+    // The outcome of a run with so much time, and the iterations at which it was scored.
     let ended = |seconds: u64| {
         let mut config = configured(&sets);
         config.auto.time_left = Some(Duration::from_secs(seconds));
@@ -332,7 +332,7 @@ fn the_readers_validation_views_are_scored_without_being_asked_for() {
     let verdict = with.1.verdict.unwrap();
     assert!(verdict.validation_psnr_db.is_some_and(|db| db > verdict.baselines.mean_colour_db), "{verdict:?}");
     assert!(with.0.gaussians == without.0.gaussians, "scoring validation views changed the training");
-    // Nobody asked for them: damaged ones do not end the run.
+    // No setting asks for these views: damaged ones do not end the run.
     let (trained, events) = run(&names_them(false), &sets);
     assert_eq!(trained.unwrap().1.verdict.unwrap().validation_psnr_db, None);
     assert!(events.iter().any(|e| matches!(e, Event::Warning { object, .. } if object == "validation views")));

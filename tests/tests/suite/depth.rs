@@ -116,7 +116,7 @@ fn further_training_leaves_out_depth_that_is_missing_unless_nothing_else_is_left
     let scene = Arc::new(session.read_scene(folder.path(), &config.scene).unwrap());
     let mut model = session.train(&config, scene.clone(), None).unwrap();
     let (finetune, never): (toml::Table, AtomicBool) = ("finetune = 2".parse().unwrap(), AtomicBool::new(false));
-    // Of fine-tuning and of re-fit what came of it, and the warnings of depth together, where the model was trained with `loss`.
+    // The outcomes of fine-tuning and of re-fit, and the warnings about depth of both, for a model that was trained with `loss`.
     let mut further = |loss: &str| {
         let trained: toml::Table = format!("loss = [{loss}]").parse().unwrap();
         model.provenance.config.insert("loss".into(), trained["loss"].clone());

@@ -196,7 +196,7 @@ fn hostile_controls_do_not_take_a_training_apart() {
         for does in ["remove", "reset", "children"] {
             let run = run(does, iterations);
             let last_notes = &run.notes[run.notes.len().saturating_sub(3)..];
-            // Removing all the time eats what training gains; the others cost little.
+            // Constant removal cancels most of what training gains; the other controls cost little.
             let least_db = if does == "remove" { FLOOR_DB } else { left_alone.psnr_db - 1.5 };
             assert!(run.psnr_db >= least_db, "'{does}', {iterations} iterations: {:.2} dB, at least {least_db:.2} are expected; {last_notes:?}", run.psnr_db);
             let count = |of: fn(&Done) -> &AtomicUsize| of(&run.done).load(SeqCst);

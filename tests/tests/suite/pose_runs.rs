@@ -12,7 +12,6 @@ use cc4dgs_play::Model;
 use cc4dgs_play::checkpoint::{CHECKPOINT, CheckpointArrays, CheckpointFile};
 use cc4dgs_tests::StopAfter;
 use cc4dgs_train::train::{CONFIG, TrainJob, train};
-use glam::DVec3;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
@@ -306,10 +305,13 @@ fn every_pose_of_a_moving_camera_is_refined() {
 fn cameras_that_share_a_point_are_refined() {
     let config = settings("flex", &[REFINED, ONE_FRAME, "train.iterations=40"]);
     let mut scene = open("procedural", &config);
-    let point = DVec3::from(scene.cameras[0].center_world());
-    for camera in &mut scene.cameras {
-        let t = -(camera.rotation_translation().0 * point);
-        (0..3).for_each(|row| camera.world_to_camera[row][3] = t[row]);
+    // They differ by a roll, so that all of them see the scene.
+    let first = scene.cameras[0].world_to_camera;
+    for (index, camera) in scene.cameras.iter_mut().enumerate() {
+        let (sin, cos) = (0.05 * index as f64).sin_cos();
+        camera.world_to_camera = first;
+        camera.world_to_camera[0] = std::array::from_fn(|k| cos * first[0][k] + sin * first[1][k]);
+        camera.world_to_camera[1] = std::array::from_fn(|k| cos * first[1][k] - sin * first[0][k]);
     }
     assert_eq!(scene.extent(), 1.0, "their distances from the mean are no unit of length");
     let count = cameras(&scene);

@@ -36,7 +36,7 @@ fn results_of_a_sweep_do_not_state_the_limits_of_a_machine() {
         let worker = Worker { registry: &registry, events: &Silent, stop: &never, limits: &limits, processes: 1 };
         match run_training(&worker, &SweepFolder::new(folder.path().join(name)), &plan, 0, None, Busy::Wait)? {
             TrainingState::Finished(mut results) => Ok(CellResult { cost: Cost::default(), ..results.remove(0) }),
-            TrainingState::Busy => panic!("nobody else works on it"),
+            TrainingState::Busy => panic!("no other process works on it"),
         }
     };
     let plain = result("plain", &[]).unwrap();

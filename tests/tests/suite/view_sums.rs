@@ -51,7 +51,7 @@ fn gradients_are_added_where_a_gaussian_is_shown() {
                     [sums[2 * row] + if shown { norm } else { 0.0 }, sums[2 * row + 1] + if shown { 1.0 } else { 0.0 }]
                 })
                 .collect();
-            // Somebody else holds them, so they are not changed in place.
+            // With a second reference to the sums they are not changed in place.
             let before = on(&sums, [rows, 2], &device);
             let after = add_gradients(before.clone(), ints(&radii, &device), on(&gradient, [rows, 2], &device), [2.0, 3.0]).unwrap();
             assert_near(after, &expected, name);

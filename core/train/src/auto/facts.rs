@@ -23,6 +23,8 @@ const MOTION_OVER_NOISE: f32 = 6.0;
 const PLAIN: f32 = 0.02;
 /// Share of border pixels of that colour from which the background is plain.
 const PLAIN_SHARE: f32 = 0.9;
+/// Share of the pixels that is opaque, below which an image says nothing of exposure.
+const LEAST_OPAQUE: f32 = 0.005;
 /// Cosine of the angle between the axes of cameras above which they see much the same: 0.6 rad.
 const ALIKE_AXES: f64 = 0.825;
 
@@ -88,7 +90,7 @@ pub struct Facts {
     pub occupied: Option<f32>,
     /// Standard deviation of the noise, of values in 0..1, where a camera has several frames.
     pub noise: Option<f32>,
-    /// Median ratio of mean brightness between neighbouring cameras of one time, as |ln|.
+    /// Median ratio of the mean brightness of opaque pixels between neighbouring cameras of one time, as |ln|.
     pub exposure: Option<f32>,
     /// How much of what one camera sees others see, where there is more than one pose.
     pub overlap: Option<Overlap>,
@@ -275,23 +277,36 @@ impl Motion {
     }
 }
 
-/// Median |ln| of the ratio of mean brightness between each camera and its nearest neighbour at the same time; `None` where few neighbours see the same.
+/// Mean grey value in 0..1 of the opaque part of an image, pixels weighted by their opacity, so that it does not depend on how much of the image the foreground
+/// covers; `None` where there is hardly any.
+fn brightness(image: &Image8) -> Option<f32> {
+    let grey = mean(grey(image).into_iter())?;
+    if image.channels != 4 {
+        return Some(grey);
+    }
+    let opacity = mean(image.data.chunks_exact(4).map(|p| f32::from(p[3]) / 255.0))?;
+    (opacity >= LEAST_OPAQUE).then_some(grey / opacity)
+}
+
+/// Median |ln| of the ratio of [`brightness`] between each camera and its nearest neighbour at the same time; `None` where few neighbours see the same.
 fn exposure(scene: &Scene, views: &[usize]) -> Result<Option<f32>> {
     let first = views.iter().map(|&v| scene.views[v].frame).min().unwrap_or(0);
     let of_first: Vec<usize> = views.iter().copied().filter(|&v| scene.views[v].frame == first).take(2 * LOOKS).collect();
     if of_first.len() < 3 {
         return Ok(None);
     }
-    let means = of_first.par_iter().map(|&v| small(scene, v).map(|image| mean(grey(&image).into_iter()).unwrap_or(0.0))).collect::<Result<Vec<_>>>()?;
+    let levels = of_first.par_iter().map(|&v| small(scene, v).map(|image| brightness(&image))).collect::<Result<Vec<_>>>()?;
     let center = |i: usize| DVec3::from(scene.camera(of_first[i]).center_world());
     let axis = |i: usize| DVec3::from(scene.camera(of_first[i]).forward_world()).normalize_or_zero();
     let mut ratios: Vec<f32> = (0..of_first.len())
         .filter_map(|i| {
-            let nearest = (0..of_first.len()).filter(|&j| j != i).min_by(|&a, &b| center(a).distance(center(i)).total_cmp(&center(b).distance(center(i))))?;
+            let own = levels[i]?;
+            let others = (0..of_first.len()).filter_map(|j| levels[j].filter(|_| j != i).map(|level| (j, level)));
+            let (nearest, other) = others.min_by(|(a, _), (b, _)| center(*a).distance(center(i)).total_cmp(&center(*b).distance(center(i))))?;
             if axis(i).dot(axis(nearest)) < ALIKE_AXES {
                 return None;
             }
-            let ratio = (means[i].max(1e-3) / means[nearest].max(1e-3)).ln().abs();
+            let ratio = (own.max(1e-3) / other.max(1e-3)).ln().abs();
             ratio.is_finite().then_some(ratio)
         })
         .collect();
@@ -303,3 +318,6 @@ fn mean(values: impl Iterator<Item = f32>) -> Option<f32> {
     let (sum, count) = values.fold((0.0f64, 0u64), |(sum, count), v| (sum + f64::from(v), count + 1));
     (count > 0).then(|| (sum / count as f64) as f32)
 }
+
+#[cfg(test)]
+mod tests;

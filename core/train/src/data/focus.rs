@@ -4,8 +4,12 @@ use glam::{DMat3, DVec3};
 
 /// A pull towards the expected distance, as a share of the number of cameras: axes that converge by less than about two degrees leave the distance open.
 const PULL: f64 = 1e-3;
-/// Cameras whose positions differ by less than this share of their coordinates stand at one point.
+/// Cameras whose positions differ by less than this share of their coordinates, or of 1, stand at one point: that is what rounding leaves of products of rotations
+/// and translations.
 const ONE_POINT: f64 = 1e-12;
+/// Cameras whose positions differ by less than this share of the distance of what they see stand at one point: a thousandth of a pixel at a focal length of 10,000
+/// pixels, and what float32 leaves of positions.
+const NO_PARALLAX: f64 = 1e-7;
 /// How many times the rig's width a rig of parallel axes is expected to look ahead, where nothing else is known.
 const AHEAD: f64 = 3.0;
 
@@ -21,7 +25,7 @@ pub(super) struct Focus {
 }
 
 /// The least-squares intersection of the optical axes `(centre, unit direction)`. `hint` is how far ahead of the cameras the scene is expected; without one it
-/// is a few rig widths. Everything scales and moves with the cameras.
+/// is a few rig widths. Everything scales and moves with the cameras, where their positions differ by more than [`ONE_POINT`].
 pub(super) fn focus(rays: &[(DVec3, DVec3)], hint: Option<f64>) -> Focus {
     let n = rays.len().max(1) as f64;
     // Relative to a camera, so that large coordinates do not cost digits.
@@ -29,7 +33,8 @@ pub(super) fn focus(rays: &[(DVec3, DVec3)], hint: Option<f64>) -> Focus {
     let mean = rays.iter().map(|r| r.0 - origin).sum::<DVec3>() / n;
     let forward = rays.iter().map(|r| r.1).sum::<DVec3>() / n;
     let spread = (rays.iter().map(|r| (r.0 - origin - mean).length_squared()).sum::<f64>() / n).sqrt();
-    let spread = (spread > ONE_POINT * origin.abs().max_element()).then_some(spread);
+    let least = (ONE_POINT * origin.abs().max_element().max(1.0)).max(NO_PARALLAX * hint.unwrap_or(0.0));
+    let spread = (spread > least).then_some(spread);
     let ahead = hint.or(spread.map(|s| AHEAD * s));
     let expected = ahead.unwrap_or(AHEAD);
     let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
@@ -79,6 +84,24 @@ mod tests {
             assert!((found.distance.unwrap() / size / still.distance.unwrap() - 1.0).abs() < 1e-6);
             assert!((found.half / size / still.half - 1.0).abs() < 1e-6);
         }
+    }
+
+    #[test]
+    fn cameras_that_differ_by_rounding_stand_at_one_point() {
+        // They turn about one point, so their axes meet there.
+        let panning = |jitter: f64, at: DVec3| {
+            let directions = [DVec3::new(0.3, 0.0, 1.0), DVec3::new(-0.3, 0.0, 1.0), DVec3::new(0.0, 0.3, 1.0)];
+            directions.map(|d| (at + jitter * DVec3::new(d.y, d.x, d.x), d.normalize()))
+        };
+        for (jitter, at, hint) in
+            [(1e-13, DVec3::ZERO, None), (1e-10, DVec3::new(0.0, 3e3, 0.0), None), (1e-13, DVec3::ZERO, Some(10.0)), (1e-7, DVec3::ONE, Some(10.0))]
+        {
+            let (found, exact) = (focus(&panning(jitter, at), hint), focus(&panning(0.0, at), hint));
+            assert_eq!((found.distance, exact.distance), (hint, hint), "{jitter} at {at}");
+            assert!((found.point - exact.point).length() < 1e-6 && (found.half - exact.half).abs() < 1e-6, "{found:?} {exact:?}");
+        }
+        let apart = focus(&panning(0.1, DVec3::ZERO), Some(10.0));
+        assert!(apart.distance.is_some_and(|d| d < 5.0), "{apart:?}");
     }
 
     #[test]

@@ -119,6 +119,15 @@ mod tests {
     }
 
     #[test]
+    fn cameras_that_differ_by_rounding_keep_their_unit_unless_points_say_more() {
+        let eyes = [[1e-13, 0.0, 0.0], [0.0, -1e-13, 0.0], [0.0, 0.0, 1e-13]];
+        let mut scene = rig(&eyes, |eye| [eye[0], eye[1], eye[2] + 1.0]);
+        assert_eq!(normalisation(&scene).scale, 1.0);
+        scene.points = Some(RawPoints { positions: vec![[0.0, 0.0, 100.0]; 5], colors: vec![[0.5; 3]; 5] });
+        assert!((normalisation(&scene).scale - 0.04).abs() < 1e-6);
+    }
+
+    #[test]
     fn json_keeps_every_bit() {
         for i in 0..2000 {
             let x = f64::from(i) * 0.618_033_988_749;

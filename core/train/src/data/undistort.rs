@@ -126,13 +126,21 @@ fn sample(image: &Image8, u: f64, v: f64, px: &mut [u8]) {
 mod tests {
     use super::*;
 
-    const LENSES: [Distortion; 6] = [
+    const LENSES: [Distortion; 10] = [
         Distortion::Brown { radial: [0.0578421, -0.0805099, 0.0, 0.0], tangential: [-0.000980296, 0.00015575] },
         Distortion::Brown { radial: [-0.28, 0.07, 0.0, 0.0], tangential: [0.001, -0.0005] },
         Distortion::Fisheye { radial: [0.02, -0.01, 0.003, -0.0005] },
         Distortion::Rational { numerator: [0.52, -2.71, 1.55], denominator: [0.41, -2.53, 1.48], tangential: [0.0006, -0.0003] },
         Distortion::ThinPrismFisheye { radial: [0.02, -0.01, 0.003, -0.0005], tangential: [0.001, -0.0005], prism: [0.002, -0.003] },
         Distortion::FieldOfView { omega: 0.6 },
+        Distortion::RadTanThinPrismFisheye {
+            radial: [0.02, -0.01, 0.003, -0.0005, 0.0002, -0.0001],
+            tangential: [0.001, -0.0005],
+            prism: [0.002, -0.0004, -0.003, 0.0006],
+        },
+        Distortion::Division { k: -0.2 },
+        Distortion::Division { k: 0.1 },
+        Distortion::EnhancedUnified { alpha: 0.6, beta: 1.2 },
     ];
 
     /// An image whose colours are the ideal coordinates, as the lens would take it, comes back with colours equal to its pinhole coordinates.

@@ -132,7 +132,7 @@ fn largest(values: impl Iterator<Item = f64>) -> f64 {
     values.fold(0.0, |a, b| if b.is_nan() { f64::INFINITY } else { a.max(b) })
 }
 
-/// Compares all cases of a kind; says what is over the bar, and why a case says nothing about digits.
+/// Compares all cases of a kind; returns errors over their bounds, and cases that cannot be compared, with the reason.
 fn check(kind: &Kind) {
     let devices = devices();
     let (mut findings, mut rows) = (Vec::new(), Vec::new());

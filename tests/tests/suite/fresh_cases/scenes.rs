@@ -16,9 +16,9 @@ const ALL_RULES: &[Rules] = &[Rules::Gsplat099, Rules::Gsplat0999, Rules::Inria]
 
 /// A kind of cases.
 pub struct Kind {
-    /// The golden scene whose like they are: `raster_NAME`.
+    /// The golden scene that the cases resemble: `raster_NAME`.
     pub name: &'static str,
-    /// The rules that they are drawn by.
+    /// The rules by which they are drawn.
     pub rules: &'static [Rules],
     /// Cases per rules.
     pub seeds: u64,

@@ -234,15 +234,15 @@ fn units_are_as_stated_and_cancel() {
     }
 }
 
-/// Where cameras move, masks cover what differs from the room without its cast, and nothing else.
+/// Where cameras move, masks cover the pixels that differ from an image of the scene without its moving bodies, and no others.
 #[test]
 fn motion_masks_cover_what_moves() {
     for name in ["handheld", "turntable"] {
         let small = SceneOptions { width: 64, ..options() };
         let full = ProceduralScene { width: 64, height: truth(name).height * 64 / truth(name).width, ..truth(name) };
         let cast = full.bodies.iter().flat_map(|body| body.objects.clone()).collect::<BTreeSet<usize>>();
-        let room = (0..full.objects.len()).filter(|object| !cast.contains(object)).map(|object| full.objects[object]).collect();
-        let empty = ProceduralScene { objects: room, ..full.clone() };
+        let fixed = (0..full.objects.len()).filter(|object| !cast.contains(object)).map(|object| full.objects[object]).collect();
+        let empty = ProceduralScene { objects: fixed, ..full.clone() };
         let scene = open(Path::new(&format!("procedural:captures/{name}")), &small, &Limits::default()).unwrap();
         let (mut both, mut moving, mut changed) = (0, 0, 0);
         for view in scene.split(Split::Test).into_iter().step_by(5) {

@@ -107,12 +107,16 @@ fn colmap_lenses_are_undone() {
         ("SIMPLE_RADIAL_FISHEYE", "60 32 24 0.01"),
         ("RADIAL_FISHEYE", "60 32 24 0.01 0.001"),
         ("THIN_PRISM_FISHEYE", "60 61 32 24 0.01 0 0.001 -0.001 0 0 0.001 0.001"),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", "60 61 32 24 0.01 0 0 0 0 0 0.001 -0.001 0.001 0 0.001 0"),
+        ("SIMPLE_DIVISION", "60 32 24 -0.1"),
+        ("DIVISION", "60 61 32 24 -0.1"),
+        ("EUCM", "60 61 32 24 0.5 1"),
         ("SIMPLE_FISHEYE", "60 32 24"),
         ("FISHEYE", "60 61 32 24"),
     ] {
         let dir = tempfile::tempdir().unwrap();
         // No image uses the second camera.
-        std::fs::write(dir.path().join("cameras.txt"), format!("1 {model} 64 48 {parameters}\n2 EUCM 64 48 60 60 32 24 0.5 1\n")).unwrap();
+        std::fs::write(dir.path().join("cameras.txt"), format!("1 {model} 64 48 {parameters}\n2 EQUIRECTANGULAR 64 48 64 48\n")).unwrap();
         std::fs::write(dir.path().join("images.txt"), "1 1 0 0 0 0 0 0 1 a.png\n\n").unwrap();
         write_image(&dir.path().join("a.png"), 64, 48, 9);
         let scene = load(dir.path()).unwrap();

@@ -82,7 +82,7 @@ impl Course {
             assert!(near(RATES[1] * self.extent, velocities, 0.01), "{what}: velocities step by {velocities}, the extent is {}", self.extent);
         }
     }
-    /// Asserts that `other`, of the same scene in another unit or at another place, is the same training.
+    /// Asserts that `other`, of the same scene in other units or with a translation, is the same training.
     pub fn check_same(&self, other: &Self, what: &str) {
         let (losses, others) = (self.losses(), other.losses());
         assert_eq!((losses.len(), self.after.len(), others.len(), other.after.len()), (STAGES[0] + STAGES[1], losses.len(), losses.len(), losses.len()));

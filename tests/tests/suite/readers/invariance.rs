@@ -189,8 +189,8 @@ fn with_points(truth: &Truth, write: Write, change: &Change) -> (tempfile::TempD
     let (root, mut found) = scene(truth, write, change);
     let PointCloud { positions, colors } = truth.scene.surface_samples(COUNT).0;
     let to_scene = found.normalisation;
-    let place = |p: &[f32; 3]| to_scene.apply(change.point(DVec3::from(p.map(f64::from))).to_array()).map(|v| v as f32);
-    found.points = Some(PointCloud { positions: positions.iter().map(place).collect(), colors });
+    let to_frame = |p: &[f32; 3]| to_scene.apply(change.point(DVec3::from(p.map(f64::from))).to_array()).map(|v| v as f32);
+    found.points = Some(PointCloud { positions: positions.iter().map(to_frame).collect(), colors });
     (root, found)
 }
 

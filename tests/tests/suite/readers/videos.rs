@@ -115,7 +115,7 @@ fn constant_rates_keep_every_frame() {
     assert!(scene.warnings.len() == 1 && scene.warnings[0].contains("none is held out"), "{:?}", scene.warnings);
     assert!(scene.split(Split::Test).is_empty());
     assert_eq!(instants(&scene), (0..40).map(|k| (k, vec![Some(k); 2])).collect());
-    // Whoever cleans a cache may leave a part of it.
+    // A cleaned cache may be incomplete.
     let images = |dir: &Path| std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.extension().is_some_and(|e| e == "png"));
     let cached = std::fs::read_dir(dir.path().join("cache")).unwrap().map(|entry| entry.unwrap().path()).find(|path| path.is_dir()).unwrap();
     images(&cached).take(7).for_each(|image| std::fs::remove_file(image).unwrap());
