@@ -41,7 +41,7 @@ def used(child):
 
 
 def run(child, seconds, note):
-    """Lets a process run for so long, by the clock, or by its processor time where `note` is told that every second. Returns its exit code if it ended."""
+    """Lets a process run for so many seconds of wall time, or, with `note`, of processor time, which `note` gets every second. Its exit code if it ended."""
     if note is None:
         return ended(child, seconds)
     code, spent = None, 0.0
@@ -53,7 +53,7 @@ def run(child, seconds, note):
 
 
 def stop(child, seconds, note):
-    """Lets a training run for so long, then asks it to write its checkpoint and end. Returns its exit code, and whether there is what it was to learn by then."""
+    """Lets a training run for so many seconds, then asks it to write its checkpoint and end. Returns its exit code, and whether it left a model."""
     code = run(child, seconds, note)
     if code is not None:
         return code, code in TRAINED

@@ -101,7 +101,7 @@ def main():
     for codec in args.codecs.split(","):
         row, machine = measure(args, codec, limits.get(codec, args.limit))
         found = {**machine, **found, "rows": [*found["rows"], row]}
-        # Whoever stops it keeps what is finished.
+        # After each row, so that an interruption keeps the finished ones.
         args.out.write_text(json.dumps(found, indent=1) + "\n")
         print(json.dumps(row), file=sys.stderr)
     for archive in args.weights:

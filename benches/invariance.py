@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Trains the same scene in other units, at another place and turned, and compares the held-out PSNR.
+"""Trains the same scene in other units, translated and rotated, and compares the held-out PSNR.
 
     benches/invariance.py SCENE OUT [--bin FILE] [--preset NAME] [--iterations N] [--device NAME] [--seeds N] [--only NAME,NAME] [--set KEY=VALUE]...
 

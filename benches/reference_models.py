@@ -28,12 +28,12 @@ def run(*command):
 
 
 def started(program, folder, stated):
-    """What began the model in `folder`: what is stated now, or the call ends."""
+    """What the model in `folder` is trained from, written if it is new; the call ends if it was begun from anything else."""
     file = folder / "begun.json"
     if any((folder / name).exists() for name in ("checkpoint", "finished.json")):
         found = json.loads(file.read_text()) if file.exists() else {}
         if not stated.items() <= found.items():
-            sys.exit(f"{folder} holds a model of another program, configuration or place of the data. Name another --out, or delete it")
+            sys.exit(f"{folder} holds a model of another program, configuration or data folder. Name another --out, or delete it")
         return found
     commit = subprocess.run(["git", "-C", str(CONFIGURATIONS), "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What scripts share that train: rows in a file, so that nothing is trained again under the same program and settings, and what happens on Ctrl-C."""
+"""Shared parts of the scripts that train: finished rows in a file, so that no training is repeated with the same program and settings, and Ctrl-C."""
 import hashlib
 import json
 import pathlib
@@ -9,11 +9,11 @@ import sys
 import threading
 
 TRAINED = (0, 6)  # Exit codes of trainings that leave a model; 6 is one below simple baselines.
-INTERRUPTED = threading.Event()  # Set once Ctrl-C was pressed: threads begin nothing more.
+INTERRUPTED = threading.Event()  # Set once Ctrl-C was pressed: threads start no more processes.
 
 
 def sha256(program):
-    """Of the file that runs as `program`: a rebuilt one is another program."""
+    """The hash of the file that runs as `program`: a rebuilt one is another program."""
     file = shutil.which(program)
     if file is None:
         sys.exit(f"{program} is not there, or cannot be run")
@@ -21,14 +21,14 @@ def sha256(program):
 
 
 def replace(file, document):
-    """Writes JSON; whoever is interrupted meanwhile keeps what was there."""
+    """Writes JSON by way of a partial file: an interruption keeps the earlier content."""
     partial = file.with_name(file.name + ".partial")
     partial.write_text(json.dumps(document, indent=1) + "\n")
     partial.replace(file)
 
 
 class Rows:
-    """Finished rows in a JSON file. Each states what it depends on, beside what was measured."""
+    """Finished rows in a JSON file. Each states what it depends on, and what was measured."""
 
     def __init__(self, file):
         self.file, self.lock = file, threading.Lock()
@@ -46,7 +46,7 @@ class Rows:
 
 
 def events(out):
-    """The events of the run in the folder `out`; a line that was cut is none. `seconds` are those of the line: in older logs some events have a later key of
+    """The events of the run in the folder `out`; an incomplete line is ignored. `seconds` are those of the line: in older logs some events have a later key of
     this name."""
     log, found = out / "events.jsonl", []
     for line in log.read_text().splitlines() if log.exists() else []:
@@ -69,7 +69,7 @@ def timed(out):
 
 
 def points(out, kind):
-    """The events of one kind, in order, one per iteration: what a resumed run did again counts as the last part did it."""
+    """The events of one kind, in order, one per iteration: of iterations that a resumed run repeated, the last event counts."""
     found = {}
     for event in timed(out):
         if event["event"] == kind:
@@ -92,7 +92,7 @@ def begin(arguments, **streams):
 
 
 def let_end(child):
-    """Gives a process that was interrupted, too, a minute to write its checkpoint."""
+    """Gives an interrupted process a minute to write its checkpoint, then kills it."""
     try:
         child.wait(60)
     except subprocess.TimeoutExpired:
@@ -100,7 +100,7 @@ def let_end(child):
 
 
 def ended(child, seconds=None):
-    """Exit code of a process, or `None` if it takes more than `seconds`. Ctrl-C interrupts it, too: it gets a minute to write its checkpoint, and nothing goes on."""
+    """Exit code of a process, or `None` if it takes more than `seconds`. Ctrl-C reaches the process, too: it gets a minute to write its checkpoint."""
     try:
         code = child.wait(seconds)
     except subprocess.TimeoutExpired:
@@ -108,14 +108,14 @@ def ended(child, seconds=None):
     except BaseException:
         let_end(child)
         raise
-    # In a thread: the process may be told before the main thread is.
+    # The process may receive the signal before the main thread of this script does.
     if INTERRUPTED.wait(1 if code in (130, -signal.SIGINT) else 0):
         raise KeyboardInterrupt
     return code
 
 
 def interrupt(pool):
-    """To be called on Ctrl-C, which the processes that threads of `pool` wait for get, too: what has not begun never will."""
+    """Call it on Ctrl-C. Running processes receive the signal, too; tasks of `pool` that have not begun are cancelled."""
     INTERRUPTED.set()
     pool.shutdown(wait=False, cancel_futures=True)
     print("interrupted; waiting for processes to end", file=sys.stderr)

@@ -1,4 +1,4 @@
-//! Operations burn lacks, per device, and the rasterizers made of them.
+//! Tensor operations that burn lacks, per device, and the rasterizers made of them.
 //!
 //! An operation has a file in each of three folders: `ops` (what it is: trait, shapes, derivative, public function), `cpu` (its kernel on slices) and `cube`
 //! (its kernel on a GPU). All three are listed here, so that a new operation is three files and their three lines in this one.

@@ -15,15 +15,15 @@ use cc4dgs_format::{
 };
 use std::path::{Path, PathBuf};
 
-/// More than a block of 2^14.
+/// Gaussians of a case: more than one block of 2^14.
 const COUNT: usize = 20_000;
-/// Of which each of three layers has more than a block.
+/// Gaussians of the case with three layers: each layer has more than one block.
 const MANY: usize = 80_000;
-/// What decides the seed of everything.
+/// The root of all seeds.
 const ROOT: u64 = 5;
-/// Gaussians of larger scores move.
+/// Gaussians with larger scores move.
 const THRESHOLD: f32 = 0.5;
-/// Streams of three layers, and of coded attributes in two.
+/// Streams that archives with three layers have, and those with coded attributes in two layers.
 const LAYERED: &[&str] = &["means.2", "sh.0.2", "sh.2"];
 const CODED: &[&str] = &["means.1", "coded", "coded.fade.rows", "coded.fade.0", "coded.life.1", "coded.velocity.2"];
 
@@ -41,7 +41,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// What an archive is made of.
+/// The contents of an archive.
 struct Case<'a> {
     name: &'static str,
     codec: &'static CodecPlugin,
@@ -49,11 +49,11 @@ struct Case<'a> {
     settings: toml::Table,
     gaussians: &'a HostGaussians,
     context: &'a CodecContext<'a>,
-    /// Streams without which it would not show what it is there for.
+    /// Streams that the archive must have; otherwise it would not test what it is for.
     streams: &'static [&'static str],
 }
 
-/// All archives, each with the next of the weight codecs.
+/// Writes all archives. Weight codecs are used in turn.
 fn write_all(folder: &Path) -> Result<Vec<PathBuf>> {
     let codecs = Entries::<CodecPlugin>::collect()?;
     let context = CodecContext { dynamic_threshold: Some(THRESHOLD), ..CodecContext::new(Seed::root(ROOT).child("codec"), Limits::default(), &Silent) };
@@ -71,7 +71,7 @@ fn write_all(folder: &Path) -> Result<Vec<PathBuf>> {
     let codec = codecs.get("compact")?;
     let layers = |number: i64| toml::Table::from_iter([("layers".into(), number.into())]);
     cases.push(Case { name: "compact-layers", codec, profile: "", settings: layers(3), gaussians: &many, context: &context, streams: LAYERED });
-    // A size is bounded, not what images lose: these show neither order nor what is not needed.
+    // The size is bounded, not the error of images: images of `View` depend neither on the order of Gaussians nor on rows that are not needed.
     cases.push(Case { name: "compact-coded", codec, profile: "max-size=1MB", settings: layers(2), gaussians: &moved, context: &seen, streams: CODED });
     let weight_codecs: Vec<&WeightCodecPlugin> = Entries::<WeightCodecPlugin>::collect()?.iter().collect();
     cases.iter().zip(weight_codecs.into_iter().cycle()).map(|(case, weight_codec)| case.write(folder, weight_codec)).collect()
@@ -100,7 +100,7 @@ impl Case<'_> {
             return Err(Error::backend(format!("archive {}", self.name), problem, "Choose Gaussians and settings for which the codec writes it"));
         }
         let weights = [WeightArray { name: "table".into(), shape: vec![64, 48], values: (0..64 * 48).map(|i| draw(i, 8)).collect() }];
-        // Codecs that have steps of their own for rows are given what these follow from.
+        // The importance of weights, from which some codecs choose steps per row.
         let importance = [(0..64 * 48).map(|i| 2f32.powi(i / 16 % 20)).collect::<Vec<f32>>()];
         let context = CodecContext { weight_importance: Some(&importance), ..CodecContext::new(weight_seed(ROOT), Limits::default(), &Silent) };
         let weights = (weight_plugin.build)(&toml::Table::new())?.encode(&weights, &context)?;
@@ -112,8 +112,8 @@ impl Case<'_> {
     }
 }
 
-/// A view of a renderer that draws nothing but attributes of plug-ins, each in pixels of its own. How much one shows depends on nothing, or on the size of its
-/// Gaussian, or on how much that is seen, so that steps grow in all the ways that there are.
+/// A view of a renderer that draws only attributes of plug-ins, each in pixels of its own. The weight of an attribute is constant, or depends on size or
+/// visibility of its Gaussian, so that every way in which steps can grow is used.
 struct View(Camera);
 
 impl RenderModel for View {
@@ -176,7 +176,7 @@ fn gaussians(count: usize) -> HostGaussians {
     out
 }
 
-/// With attributes that are needed where something moves, and in some rows.
+/// `gaussians` with attributes that are needed in moving rows, and in some rows.
 fn with_attributes(mut gaussians: HostGaussians) -> HostGaussians {
     let count = gaussians.len();
     let attribute = |width: usize, column: usize| ExtraAttribute::exact(width, (0..width * count).map(|i| draw(i, column)).collect());

@@ -1,7 +1,7 @@
 //! Bytes, seconds and memory of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE][;SETTINGS]... [--json FILE]`.
 //!
-//! Prints a line of JSON per codec; with `--json`, all of them and the machine are written as one document. Memory is the most that the process had, so only
-//! the first codec has it. `ENCODES` and `DECODES` say how often each is timed (1 and 3 by default); encoding is not repeated after a minute. Where `ARCHIVES`
+//! Prints a line of JSON per codec; with `--json`, all of them and the machine are written as one document. Memory is the peak of the process, so only the
+//! first row has it. `ENCODES` and `DECODES` say how often each is timed (1 and 3 by default); encoding is not repeated after a minute. Where `ARCHIVES`
 //! names a folder, the archives are written there; where `DECODED` does, what was decoded too, as PLY files.
 //!
 //! `codec_speed FILE.cc4d CODEC[:PROFILE][;SETTINGS] [--json FILE]` decodes such an archive once in a process that has done nothing else, and says how much

@@ -5,7 +5,7 @@
 //! * `quantize`: each component quantised separately; the baseline for lossy codecs.
 //! * `vq`: codebooks for shape and colour, as in CompGS.
 //! * `sorted-image`: Gaussians sorted into a square, their columns stored as images.
-//! * `compact`: steps by what is seen, entropy coding with stored distributions; the smallest files.
+//! * `compact`: steps by the effect on images, entropy coding with stored distributions; the smallest files.
 //! * `spz`: Niantic's format, which viewers read.
 //!
 //! Weight codecs for the weights of deformers: `fp32`, `fp16`, `int8`, `compact`.

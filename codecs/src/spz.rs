@@ -160,7 +160,7 @@ mod tests {
         let beside = |streams: &[Stream]| streams.iter().find(|s| s.name == BESIDE).map_or(0, |s| s.bytes.len());
         let (streams, resting) = stored(&gaussians, Some(f32::INFINITY));
         assert_ne!(resting.quaternions, gaussians.quaternions);
-        assert_eq!(beside(&streams), 1 + 4 * 200, "a static model pays for its scores alone");
+        assert_eq!(beside(&streams), 1 + 4 * 200, "a static model needs only its scores beside the file");
         assert_eq!(stored(&gaussians, Some(1.0)).1, resting);
         for threshold in [None, Some(f32::NEG_INFINITY), Some(0.99)] {
             let (streams, moving) = stored(&gaussians, threshold);

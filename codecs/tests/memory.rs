@@ -13,7 +13,7 @@ struct Counting;
 
 static NOW: AtomicUsize = AtomicUsize::new(0);
 static MOST: AtomicUsize = AtomicUsize::new(0);
-/// Held by each test: another one would be counted, too.
+/// Held by each test, because allocations of a test that runs at the same time would be counted, too.
 static ALONE: Mutex<()> = Mutex::new(());
 
 fn add(bytes: usize) {

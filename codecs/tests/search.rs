@@ -62,7 +62,7 @@ impl TrainingViews for Views {
     }
 }
 
-/// Views of a split. Nobody may ask for the images of one that does not judge.
+/// Views of a split. Reading an image fails the test unless the views judge losses.
 struct OfSplit<'a> {
     views: &'a Views,
     judges: bool,

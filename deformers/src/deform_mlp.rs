@@ -93,7 +93,7 @@ impl DeformMlp {
         };
         let add = |name: &str, values| parameter(format!("net.{name}"), Part::Net, 0, values, device);
         let mut last = layers("after", chain(after.input, &after.trunk));
-        // Published heads are random: their first offsets move what stands still, and short runs never put it back.
+        // Published heads are random: their first offsets move static parts of the scene, and short runs never undo it.
         last.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(w, out)));
         let mut parameters = vec![add("before", layers("before", chain(input, &before.trunk))), add("after", last)];
         if time.is_some() {

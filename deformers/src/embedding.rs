@@ -1,9 +1,10 @@
 //! The deformer of E-D3DGS: a learned vector per Gaussian and one per time, instead of coordinates, feed a coarse and a fine network (Bae et al. 2024).
 //!
-//! The table of times is resized and then read by linear interpolation: the coarse network sees few rows, the fine one all of them. Neighbours shall have
-//! similar vectors. The published code compares every Gaussian with all of its 20 nearest, found when their number changed; this one compares random pairs of
-//! present neighbours. Its time offsets per camera are omitted, because a model here has no cameras. So is a term of its loss, the sigmoid of the mean opacity
-//! logit (weight 1e-4), because a deformer does not see opacities; the loss term `opacity`, the mean of the sigmoids, is near it.
+//! The table of times is resized and then read by linear interpolation: the coarse network sees few rows, the fine one all of them. A loss makes
+//! vectors of neighbours similar. The published code compares every Gaussian with its 20 nearest, which it finds when the number of Gaussians changes; this one
+//! compares random pairs of neighbours of the iteration. Its time offsets per camera are omitted, because a model here has no cameras. So is a term of its
+//! loss, the sigmoid of the mean opacity logit (weight 1e-4), because a deformer does not see opacities; the loss term `opacity`, the mean of the sigmoids, is
+//! near it.
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
@@ -134,7 +135,7 @@ impl Embedding {
             let mut values = weights::glorot_with_bias(own.child("trunk"), input, w);
             for (i, head) in network.heads.iter().enumerate() {
                 values.extend(weights::glorot_with_bias(own.index(i as u64).child("first"), w, w));
-                // As in `hexplane`: the published random layer tears the image apart at first.
+                // As in `hexplane`: the published random layer displaces all Gaussians at first.
                 values.extend(weights::zeros(w, head[1]));
             }
             parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
@@ -291,7 +292,7 @@ mod tests {
         }
         let (far, _) = term(&smooth(0.8), &[0.0, 9.0], &[0.1, 0.0, 0.4, 0.4], 0.5).unwrap();
         assert!(far < 1e-9, "{far}");
-        // Duplicates of the same Gaussian, and one that is nowhere.
+        // Duplicates of the same Gaussian, and one whose centre is NaN.
         let (value, gradient) = term(&smooth(1.0), &[0.2, 0.2, f32::NAN], &[0.0, 0.0, 3.0, 4.0, 7.0, 7.0], 0.5).unwrap();
         assert!((value - 5.0).abs() < 1e-4 && gradient.iter().all(|g| g.is_finite()) && gradient[4..] == [0.0, 0.0], "{value}: {gradient:?}");
     }

@@ -1,7 +1,7 @@
 //! Gaussians that are free in time (FreeTimeGS, with the gate of FreeTimeGS++ and the flat-topped life of SharpTimeGS).
 //!
-//! Each has a velocity and a [`Life`], and nothing else moves it. The mean of 1 - g, where g is the gate of a life, is penalised with the weight `gate_weight`, so
-//! that only what appears or moves becomes temporary.
+//! Each has a velocity and a [`Life`]; there is no other motion. The mean of 1 - g, where g is the gate of a life, is penalised with the weight `gate_weight`,
+//! so that only what appears or moves becomes temporary.
 
 use crate::parts::lives::{Life, LifeSettings, side_by_side};
 use burn::tensor::{Device, Tensor};

@@ -156,7 +156,7 @@ impl Grid4d {
         let layers = |name: &str, pairs: &[(usize, usize)]| -> Vec<f32> {
             pairs.iter().enumerate().flat_map(|(i, &(a, b))| weights::torch(seed.child(name).index(i as u64), a, b)).collect()
         };
-        // Published heads are random: their first offsets move what stands still, and short runs never put it back.
+        // Published heads are random: their first offsets move static parts of the scene, and short runs never undo it.
         let mut heads = layers("heads", &vec![(s.width, s.width); s.depth]);
         heads.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(s.width, out)));
         for (name, values) in [

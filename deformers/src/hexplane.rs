@@ -127,7 +127,7 @@ impl HexPlane {
         for (i, head) in network.heads.iter().enumerate() {
             let own = seed.child("heads").index(i as u64);
             values.extend(weights::glorot_with_bias(own.child("first"), w, w));
-            // The published layer is random: its first offsets tear the image apart, and short runs never recover.
+            // The published layer is random: its first offsets displace all Gaussians, and short runs never recover.
             values.extend(weights::zeros(w, head[1]));
         }
         parameters.push(parameter("net".into(), Part::Net, NET, values, device));

@@ -1,4 +1,4 @@
-//! `life = true` beside any deformer: its Gaussians have lives too, for what appears, vanishes or is too fast for it.
+//! The layer `life`: Gaussians of any deformer get lives, for content that appears, vanishes or is too fast for the deformer.
 
 use crate::parts::lives::{Life, side_by_side};
 use burn::tensor::Tensor;
@@ -101,7 +101,7 @@ impl Deformer for WithLife {
             offsets.opacity_log_factor = Some(offsets.opacity_log_factor.map_or(log_factor.clone(), |own| own + log_factor));
             offsets
         };
-        // What is there at all times is moved by the inner deformer alone; its velocity and its life have no gradient.
+        // A Gaussian that is visible at all times is moved by the inner deformer alone; its velocity and its life have no gradient.
         Ok(inner.into_iter().zip(self.life.at(lives, times_norm, true)?).map(with_life).collect())
     }
     fn parameters(&self) -> Vec<&Parameter> {

@@ -19,7 +19,7 @@ pub fn check(gaussians: &HostGaussians, format: &str) -> Result<()> {
     gaussians.validate(&format!("Gaussians to write as {format}"), &Limits { max_gaussians: u64::MAX, ..Limits::default() })
 }
 
-/// Logit of an opacity that nobody sees (2e-35); that of opacity 0 is not finite.
+/// Logit of an invisible opacity (2e-35); that of opacity 0 is not finite.
 const INVISIBLE: f32 = -80.0;
 
 /// `gaussians` for formats that hold them as they are trained. Rotations of length zero, which are not drawn here, become the identity and invisible: other programs

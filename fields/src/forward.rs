@@ -1,4 +1,4 @@
-//! Small networks, evaluated row by row: slower than the kernels of the devices, and anywhere.
+//! Small networks, evaluated row by row: slower than the kernels of the devices, but without burn.
 
 use crate::networks::{LAYER_NORM_EPSILON, MishShape, ReluShape};
 

@@ -11,12 +11,12 @@ pub const MAX_DIMS: usize = 4;
 /// Multipliers of the spatial hash (Müller et al. 2022).
 pub const PRIMES: [u32; MAX_DIMS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
-/// What points outside 0..1 get.
+/// The features of points outside 0..1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outside {
     /// Zeros, and no gradient.
     Zero,
-    /// What the nearest face has.
+    /// The features at the nearest face.
     Clamp,
 }
 
@@ -50,7 +50,7 @@ pub struct GridShape {
     pub smooth: bool,
     /// Whether the last cell ends with the last vertex, so that x = 1 lies at it (align_corners).
     pub clamps: bool,
-    /// What points outside get.
+    /// The features of points outside 0..1.
     pub outside: Outside,
 }
 

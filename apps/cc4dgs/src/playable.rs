@@ -16,7 +16,7 @@ use std::sync::atomic::AtomicBool;
 /// Longer side of the poster in pixels.
 const POSTER: u32 = 320;
 
-/// Where plug-ins are found, what the deformer is on, who listens, and who may stop the work.
+/// Registry, device, limits, events and stop flag of the work.
 #[derive(Clone, Copy)]
 pub struct Surroundings<'a> {
     /// The linked plug-ins.
@@ -32,13 +32,13 @@ pub struct Surroundings<'a> {
 }
 
 impl<'a> Surroundings<'a> {
-    /// Those of a session.
+    /// Those of a session, with its own stop flag.
     pub fn of(session: &'a Session, stop: &'a AtomicBool) -> Self {
         Self { registry: session.registry(), device: session.device(), limits: session.limits(), events: session.events(), stop }
     }
 }
 
-/// How models are stored that are no archive yet.
+/// How models that are no archive yet are stored.
 #[derive(Clone, Copy, Debug)]
 pub struct Storage<'a> {
     /// Codec of the Gaussians: `name` or `name:profile`.
@@ -53,7 +53,7 @@ impl Default for Storage<'_> {
     }
 }
 
-/// An archive, and the model as it comes out of it: codecs move and reorder Gaussians.
+/// An archive and the model that is decoded from it: codecs round and reorder Gaussians.
 pub struct Stored {
     /// The archive.
     pub archive: Archive,
@@ -77,7 +77,7 @@ pub struct PlayableOptions<'a> {
     pub baked: bool,
 }
 
-/// An archive that plays, and how its layer came out.
+/// An archive that plays, and the report about its layer.
 pub struct Playable {
     /// The archive.
     pub bytes: Vec<u8>,

@@ -3,8 +3,8 @@
 use cc4dgs_core::{AppearanceContext, DeformerContext, PosesContext, Registry, Result, Seed, parse_device, split_kind};
 use cc4dgs_train::config::RunConfig;
 
-/// Builds every plug-in of `config` once and drops it. A mistake in the settings of the deformer should not wait for the main stage, nor leave a
-/// folder behind.
+/// Builds every plug-in of `config` once and drops it. A wrong setting of the deformer is reported now and not before the main stage, and no
+/// folder is created for it.
 ///
 /// # Errors
 /// Those of the plug-ins: unknown names, unknown settings, values out of range; and a device that does not answer.

@@ -14,12 +14,12 @@ pub enum Existing {
     Refuse,
     /// Go on from its checkpoint.
     Resume,
-    /// Start anew in its place.
+    /// Replace it by a new run.
     Overwrite,
 }
 
-/// Refuses a folder that holds a run which would be overwritten unasked, one to go on from that holds no checkpoint, a file, and a folder that cannot be written.
-/// `remedy` says what to do instead. Nothing is created.
+/// Refuses a folder with a run unless it may be overwritten, a folder without a checkpoint if a run is to be resumed, a file, and a folder that cannot be
+/// written. `remedy` says what to do instead. Nothing is created.
 ///
 /// # Errors
 /// [`Error::Parameter`] that names the folder and what is found there; [`Error::Io`] for a folder that cannot be written.
@@ -38,7 +38,7 @@ pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<(
     }
 }
 
-/// Tries to write beside what will be there; a file without a name leaves nothing behind.
+/// Creates a file without a name in the nearest folder that exists, to test that it can be written.
 fn check_writable(folder: &Path) -> Result<()> {
     let there = folder.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
     tempfile::tempfile_in(there).map(drop).map_err(|e| Error::io(there, e))
@@ -57,7 +57,7 @@ mod tests {
         check(Existing::Refuse).unwrap();
         let file = check_folder(&folder.path().join("notes.txt"), Existing::Overwrite, "Pass --overwrite").unwrap_err().to_string();
         assert!(file.contains("notes.txt: it is a file"), "{file}");
-        // A file in the way stops administrators, too.
+        // Unlike missing permissions, a file in place of a folder stops administrators, too.
         let below = check_folder(&folder.path().join("notes.txt/deep/run"), Existing::Refuse, "Pass --overwrite").unwrap_err();
         assert!(matches!(below, Error::Io { .. }) && below.to_string().contains("notes.txt: "), "{below}");
         check_folder(&folder.path().join("deep/run"), Existing::Refuse, "Pass --overwrite").unwrap();

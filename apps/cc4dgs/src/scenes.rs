@@ -5,7 +5,7 @@ use cc4dgs_play::model::Model;
 use cc4dgs_train::data;
 use std::path::Path;
 
-/// Keys of `[scene]` that a stored configuration must not choose: programs to run, folders to write, memory to take.
+/// Keys of `[scene]` that a stored configuration must not set: programs to run, folders to write, memory to use.
 const OURS_ALONE: [&str; 3] = ["ffmpeg", "video_cache", "cache_mb"];
 
 /// Opens the dataset at `path` with the scene options that `model` was trained with, and `sets` (`scene.key=value`) laid over them. Other frames keep

@@ -132,7 +132,7 @@ impl Session {
         Ok(self.adopted(layers.config()?))
     }
     /// Opens the dataset at `path` and chooses the settings of a training by looking at it (the preset `auto`), with `key=value` overrides, on this session's device
-    /// and limits. `auto.minutes=5` states the time there is.
+    /// and limits. `auto.minutes=5` states the time for the training.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after [`Session::stop`]; as [`Session::config`] and [`Session::read_scene`].

@@ -94,7 +94,7 @@ const CODEC: [&str; 18] = [
     "-1",
 ];
 
-/// A video that is fed image by image; no image is stored. It appears once it is finished.
+/// Encodes a video image by image, without files of single images. The video appears once it is finished.
 pub struct VideoWriter {
     out: PathBuf,
     fps: f64,
@@ -112,7 +112,7 @@ struct Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // A video that is not finished is not wanted; after `finish`, the process is gone already.
+        // Ends the process of an unfinished video; after `finish` it has ended already.
         self.ffmpeg.kill().ok();
         self.ffmpeg.wait().ok();
     }
@@ -200,7 +200,7 @@ impl Running {
 fn ffmpeg() -> Command {
     let mut command = Command::new("ffmpeg");
     command.args(["-y", "-loglevel", "error"]);
-    // Ctrl-C is for this program, which then ends the video.
+    // Ctrl-C reaches this program alone, which then ends the video.
     #[cfg(unix)]
     std::os::unix::process::CommandExt::process_group(&mut command, 0);
     command

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// The first key of every result: the version of the program that wrote it. Files that begin otherwise are not replaced.
 const MARK: &str = "cc4dgs";
 
-/// What [`is_result`] tells, in words.
+/// The description of files for which [`is_result`] is true, for errors.
 const RESULT: &str = "a result that --json wrote";
 
 /// Where results go.
@@ -35,8 +35,8 @@ impl Output {
     pub fn json_file(&self) -> Option<&Path> {
         self.json.as_deref().filter(|p| p.as_os_str() != "-")
     }
-    /// Refuses a file for the JSON that exists and is no result of this program, and removes an earlier result: a command that fails would leave it in the place
-    /// of its own. Call it before any work.
+    /// Refuses a file for the JSON that exists and is no result of this program, and removes an earlier result, so that it is not taken for the result of a
+    /// command that fails. Call it before any work.
     pub fn begin(&self) -> Result<()> {
         let Some(file) = self.json_file() else { return Ok(()) };
         refuse_other_content(file, RESULT, is_result)?;

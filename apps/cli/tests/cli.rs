@@ -95,7 +95,7 @@ fn mistakes_end_with_their_own_exit_code() {
         let said = fail(&args.split(' ').collect::<Vec<_>>(), 2);
         assert!(said.contains(part), "{args}: {said}");
     }
-    // So is what would be replaced.
+    // Files that would be replaced are refused as early.
     let kept = folder.path().join("kept.ply");
     std::fs::write(&kept, "mine").unwrap();
     for command in [&["export", "ply"][..], &["decompress"]] {
@@ -111,7 +111,7 @@ fn mistakes_end_with_their_own_exit_code() {
     let output = run(&["info", text(&broken), "--json"]);
     let object: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((output.status.code(), &object["error"]["exit_code"]), (Some(3), &Value::from(3)));
-    // What an earlier command found is not taken for the result of one that failed.
+    // The result of an earlier command is not taken for that of one that failed.
     let file = folder.path().join("earlier.json");
     succeed(&["plugins", "cdf", "-q", "--json", text(&file)]);
     assert!(file.is_file());
@@ -151,14 +151,14 @@ fn a_scene_goes_through_the_whole_chain() {
     assert!(number("/frame_ms/mean") > 0.0);
     assert_eq!(report["images"].as_array().unwrap().len(), 4);
     assert!(image::open(&sheet).unwrap().width() > 3 * 40);
-    // Neither a contact sheet nor renders replace what is none.
+    // A contact sheet replaces only PNG images, and renders replace only renders.
     let (renders, measure) = (at("renders"), ["eval", text(&archive), "--scene", "procedural:tiny", "-q"]);
     let draw = [&measure[..], &["--sheet-rows", "0", "--renders", text(&renders)]].concat();
     assert!(fail(&[&measure[..], &["--sheet", text(&archive)]].concat(), 2).contains("not a PNG image"));
     succeed(&[&measure[..], &["--sheet", text(&sheet)]].concat());
     succeed(&draw);
     assert!(fail(&draw, 2).contains("--overwrite"));
-    // Renders stay where a command has none to put in their place.
+    // A command without new renders keeps the old ones.
     assert!(fail(&[&draw[..], &["--overwrite", "--split", "validation"]].concat(), 2).contains("no view of split"));
     assert_eq!(std::fs::read_dir(&renders).unwrap().count(), 5, "four renders and the mark of the folder");
     succeed(&[&draw[..], &["--overwrite", "--max-views", "1"]].concat());
@@ -230,7 +230,7 @@ fn every_kind_of_model_is_taken_everywhere() {
     succeed(&["decompress", text(&dir), "--out", text(&spz), "-q"]);
     let checkpoint = dir.join("checkpoint");
     let mut sources = vec![(dir.clone(), "checkpoint"), (checkpoint, "checkpoint"), (archive, "archive"), (ply, "ply"), (spz, "spz")];
-    // Somebody else's file, where the folder with real data is named.
+    // A file of another program, if CC4DGS_DATA names the folder with real data.
     match std::env::var_os("CC4DGS_DATA").map(|root| Path::new(&root).join("playbot_31k/lod3_decoded_3dgs.ply")).filter(|p| p.is_file()) {
         Some(file) => sources.push((file, "ply")),
         None => eprintln!("CC4DGS_DATA names no folder with playbot_31k: its part of the test is skipped"),
@@ -258,7 +258,7 @@ fn every_kind_of_model_is_taken_everywhere() {
         assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
         assert!(report["psnr_db"].as_f64().unwrap().is_finite() && report["size_mb"]["total"].as_f64().unwrap() > 0.0, "{source}: {report}");
     }
-    // What is no model is said to be none.
+    // A file that is no model, and a folder without one, are refused as such.
     std::fs::write(at("notes.txt"), "no model").unwrap();
     for bad in [at("notes.txt"), at("frames")] {
         assert!(fail(&["compress", text(&bad), "--out", text(&at("no.cc4d")), "-q"], 3).contains("SPZ"));

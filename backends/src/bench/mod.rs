@@ -18,7 +18,7 @@ use std::time::Instant;
 
 /// Share of L1 in the loss.
 const LAMBDA: f32 = 0.8;
-/// Learning rate; small, so that the scene stays what it is while it is timed.
+/// Learning rate; small, so that the scene hardly changes while it is timed.
 const LEARNING_RATE: f64 = 1e-6;
 /// Float32 operations per (Gaussian, pixel) evaluation, counted in the source of both blending kernels: 32 forwards, 48 backwards.
 pub const OPERATIONS_PER_PAIR: f64 = 80.0;
@@ -34,14 +34,14 @@ pub struct StepCase {
     pub gaussians: usize,
 }
 
-/// The cases that published CPU timings exist for.
+/// The cases for which published CPU timings exist.
 pub const STANDARD_CASES: [StepCase; 3] = [
     StepCase { width: 134, height: 239, gaussians: 10_000 },
     StepCase { width: 269, height: 479, gaussians: 10_000 },
     StepCase { width: 134, height: 239, gaussians: 50_000 },
 ];
 
-/// What a case took.
+/// Times and counts of a case.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct StepTiming {
     /// Which workload.

@@ -23,7 +23,7 @@ pub const SCENE_CASES: [SceneCase; 2] = [
     SceneCase { name: Cow::Borrowed("technicolor"), size: StepCase { width: 2048, height: 1088, gaussians: 335_000 }, dynamic_share: 0.12 },
 ];
 
-/// Gaussians and megapixels along which costs are followed.
+/// Numbers of Gaussians, and megapixels, for which [`growth`] makes cases.
 const GROWTH: ([usize; 8], [f64; 6]) = ([10_000, 30_000, 100_000, 335_000, 1_000_000, 2_000_000, 3_000_000, 5_000_000], [0.1, 0.3, 1.0, 2.0, 4.0, 8.0]);
 
 /// The first scene with ever more Gaussians, then with ever larger images.
@@ -50,13 +50,13 @@ pub fn shrunk(case: &SceneCase, share: f64) -> SceneCase {
     SceneCase { size, ..case.clone() }
 }
 
-/// Gaussians the statistics below were measured on: `panoptic_basketball` trained for 12,000 iterations.
+/// Number of Gaussians on which the statistics below were measured: `panoptic_basketball` trained for 12,000 iterations.
 const MEASURED: f32 = 50_000.0;
-/// Mean and deviation of the log-scale of the longest axis there.
+/// Mean and standard deviation of the log-scale of the longest axis.
 const LONGEST: (f32, f32) = (-3.24, 0.9);
-/// How much shorter the other axes are, in log-scale, on average and in deviation.
+/// Difference of the log-scales of the other axes from the longest one: mean and standard deviation.
 const SHORTER: [(f32, f32); 2] = [(0.6, 0.5), (1.9, 1.4)];
-/// Mean and deviation of the opacity logit there.
+/// Mean and standard deviation of the opacity logit.
 const LOGIT: (f32, f32) = (0.1, 2.9);
 /// Half the width and the height of the room, its depth, world units; the camera stands at the origin and looks along z.
 const HALF_WIDTH: f32 = 3.0;
@@ -64,7 +64,7 @@ const HEIGHT: f32 = 3.0;
 const DEPTH: f32 = 6.0;
 /// Bodies that move.
 const BODIES: u64 = 4;
-/// Dynamic score of what moves and of what does not.
+/// Dynamic scores of moving and of static Gaussians.
 const SCORES: [f32; 2] = [10.0, -10.0];
 
 /// The scene of `case`; the same for the same seed. Gaussians that move come first.

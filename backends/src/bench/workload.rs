@@ -146,7 +146,7 @@ fn neighbour_distances(means: &[f32]) -> Vec<f32> {
             let mut squared: Vec<f32> =
                 cells.flat_map(|c| &members[c]).filter(|&&j| j != i).map(|&j| (0..3).map(|k| (means[3 * i + k] - means[3 * j + k]).powi(2)).sum()).collect();
             squared.sort_by(f32::total_cmp);
-            // Anything nearer than the ring is wide has been seen.
+            // All points nearer than the width of the ring have been compared.
             let certain = squared.len() >= 3 && squared[2].sqrt() <= ring as f32 * cell_size;
             if certain || ring >= side {
                 let found = squared.len().clamp(1, 3);

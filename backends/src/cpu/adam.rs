@@ -26,23 +26,23 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
         if sound && visible.is_none_or(|rows| rows.iter().all(|&r| r != 0)) {
             return dispatch(Update { p, m, v, g, keep: None, scalars });
         }
-        // 1 for rows that move, 0 for others.
-        let mut moves = scratch(p.len() / width);
+        // 1 for rows that are updated, 0 for others.
+        let mut updated = scratch(p.len() / width);
         match visible {
-            Some(visible) => moves.iter_mut().zip(visible).for_each(|(moves, &visible)| *moves = if visible != 0 { 1.0 } else { 0.0 }),
-            None => moves.fill(1.0),
+            Some(visible) => updated.iter_mut().zip(visible).for_each(|(updated, &visible)| *updated = if visible != 0 { 1.0 } else { 0.0 }),
+            None => updated.fill(1.0),
         }
         if !sound {
-            for (moves, g) in moves.iter_mut().zip(g.chunks_exact(width)) {
+            for (updated, g) in updated.iter_mut().zip(g.chunks_exact(width)) {
                 if !g.iter().all(is_sound) {
-                    *moves = 0.0;
+                    *updated = 0.0;
                 }
             }
         }
         if width >= WIDE_ROW {
             let mut start = 0;
-            for row in 0..=moves.len() {
-                if moves.get(row).is_some_and(|moves| *moves != 0.0) {
+            for row in 0..=updated.len() {
+                if updated.get(row).is_some_and(|updated| *updated != 0.0) {
                     continue;
                 }
                 let run = start * width..row * width;
@@ -52,11 +52,11 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
         } else {
             let mut keep = scratch(p.len());
             match width {
-                1 => keep.copy_from_slice(&moves),
-                3 => repeat::<3>(&mut keep, &moves),
-                4 => repeat::<4>(&mut keep, &moves),
-                9 => repeat::<9>(&mut keep, &moves),
-                _ => keep.chunks_exact_mut(width).zip(moves.iter()).for_each(|(keep, moves)| keep.fill(*moves)),
+                1 => keep.copy_from_slice(&updated),
+                3 => repeat::<3>(&mut keep, &updated),
+                4 => repeat::<4>(&mut keep, &updated),
+                9 => repeat::<9>(&mut keep, &updated),
+                _ => keep.chunks_exact_mut(width).zip(updated.iter()).for_each(|(keep, updated)| keep.fill(*updated)),
             }
             dispatch(Update { p, m, v, g, keep: Some(&keep), scalars });
         }

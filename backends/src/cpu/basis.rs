@@ -1,4 +1,4 @@
-//! Combinations of shared functions on the CPU. A frame reads every coefficient once, so memory bandwidth is the limit.
+//! Combinations of basis functions on the CPU. A frame reads every coefficient once, so memory bandwidth is the limit.
 //!
 //! Outputs are stored head after head, each `[M, outputs]`; so are coefficients and their gradient, each `[M, outputs x functions]`, as networks write them.
 

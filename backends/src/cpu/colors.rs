@@ -11,7 +11,7 @@ fn rgb(planes: &[f32], pixels: usize, at: usize, count: usize) -> [&[f32]; 3] {
     [0, 1, 2].map(|c| &planes[c * pixels + at..][..count])
 }
 
-/// Blocks of the red, green and blue of `out`, with their first pixels; what follows the three planes is left alone.
+/// Blocks of the red, green and blue of `out`, with their first pixels; planes behind these three are unchanged.
 fn blocks(out: &mut [f32], pixels: usize) -> impl IndexedParallelIterator<Item = (usize, [&mut [f32]; 3])> {
     let (red, rest) = out.split_at_mut(pixels);
     let (green, blue) = rest.split_at_mut(pixels);

@@ -31,7 +31,7 @@ pub fn piece(head: &[f32], width: usize, times: usize, time: usize) -> Vec<f32> 
     out
 }
 
-/// The array of which these are the pieces, time after time and head after head; zeros in place of those that are `None`.
+/// The array of which these are the pieces, time after time and head after head; zeros for pieces that are `None`.
 pub fn join(pieces: &[Option<&[f32]>], layout: &PieceLayout) -> Vec<f32> {
     let mut out = vec![0.0f32; layout.len()];
     let whole: Vec<usize> = layout.widths.iter().map(|width| layout.times * width).collect();

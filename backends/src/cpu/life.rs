@@ -28,16 +28,16 @@ fn columns(rows: &[[f32; WIDTH]]) -> Columns<WIDTH> {
     out
 }
 
-/// What attributes say, whatever the time.
+/// The quantities of a life that do not depend on time.
 #[derive(Clone, Copy)]
 struct Life<S: Simd> {
     center: Lanes<S>,
     half_width: Lanes<S>,
     falloff: Lanes<S>,
     gate: Lanes<S>,
-    /// 1 - gate, which does not cancel.
+    /// 1 - gate, computed without cancellation.
     rest: Lanes<S>,
-    /// The same, but 0 up to [`LASTING`].
+    /// `rest`, but 0 where it is at most [`LASTING`].
     temporary: Lanes<S>,
     velocity: [Lanes<S>; 3],
 }
@@ -76,7 +76,7 @@ impl<S: Simd> Life<S> {
         let inverse = one / (small + 1.0);
         let (larger, smaller) = (inverse, small * inverse);
         let below = logit.lt(center.like(0.0));
-        // A gate that is not a number stays one.
+        // A gate that is NaN stays NaN.
         let rest = unless_nan(below.select(larger, smaller), logit);
         Self {
             center,
@@ -98,7 +98,7 @@ impl<S: Simd> Life<S> {
         let factor = self.gate + self.temporary * life;
         At { since, in_falloffs, life, factor: unless_nan(factor.max(like(LEAST_FACTOR)).min(like(1.0)), factor) }
     }
-    /// What velocities are multiplied by.
+    /// The factor of the velocity.
     #[inline(always)]
     fn moving(&self, rules: &LifeRules) -> Lanes<S> {
         if rules.gated_velocity { self.temporary } else { self.center.like(1.0) }

@@ -6,7 +6,7 @@
 //! adjoint of the blur is the blur.
 //!
 //! Where image and target are equal the similarity is 1 and the gradient 0, so only the box of the pixels that differ is swept, with the margin that the windows
-//! reach: on a plain background most of the image is skipped.
+//! cover: on a plain background most of the image is skipped.
 
 use crate::cpu::scratch::scratch;
 use crate::cpu::simd::{Lanes, dispatch};
@@ -22,7 +22,7 @@ const PADDING: usize = 16;
 /// Rows per task: enough work to be worth a task, few enough to balance two threads on a small image.
 const ROWS: usize = 8;
 
-/// What the loss is made of, averaged over all pixels and channels.
+/// The terms of the loss, averaged over all pixels and channels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PhotometricTerms {
     /// Mean absolute difference.
@@ -113,14 +113,14 @@ pub fn photometric(
     PhotometricTerms { l1: total[0] / count, ssim: total[1] / count, mse: total[2] / count }
 }
 
-/// The part of an image that is looked at.
+/// The part of an image that the sweeps compute.
 struct Sweep {
     /// Columns of the image.
     width: usize,
     /// Rows and columns whose gradient may differ from 0.
     rows: Range<usize>,
     columns: Range<usize>,
-    /// Those of them whose similarity may differ from 1, counted from the first of them.
+    /// The rows and columns whose similarity may differ from 1, counted from the start of `rows` and `columns`.
     similar_rows: Range<usize>,
     similar_columns: Range<usize>,
 }
@@ -277,7 +277,7 @@ impl WithSimd for FirstRow<'_> {
 /// `E[x]`, `E[x^2]` and `E[xy]`.
 struct SecondRow<'a> {
     taps: [&'a [f32]; 11],
-    /// Those whose similarity is wanted; the derivatives of the others are 0.
+    /// The columns whose similarity counts; in the others the derivatives are 0.
     columns: Range<usize>,
     /// Three rows of blurred derivatives.
     out: Option<&'a mut [f32]>,

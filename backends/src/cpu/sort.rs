@@ -39,7 +39,7 @@ pub fn stable_order(keys: &[u32], bound: u64) -> Vec<u32> {
         indices.par_chunks(part).zip(&mut starts).for_each(|(indices, starts)| {
             for &index in indices {
                 let next = &mut starts[digit(index)];
-                // SAFETY: the counts give every index a place of its own.
+                // SAFETY: the counts give every index a position of its own.
                 unsafe { order.slice(*next as usize, 1)[0] = index };
                 *next += 1;
             }

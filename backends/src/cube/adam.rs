@@ -1,4 +1,4 @@
-//! The fused Adam step on the device: one sweep. Wide rows have a sweep before it that decides which of them move.
+//! The fused Adam step on the device: one sweep. Before it, another sweep marks which wide rows are updated.
 
 use super::tensor::{THREADS, constant, owned, workgroups_for};
 use crate::ops::adam::{AdamOps, AdamScalars, GRADIENT_LIMIT};
@@ -9,7 +9,7 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Upper bound on the values of a row for which every value checks the whole row; wider rows are checked once, by a launch before.
+/// Upper bound on the width of narrow rows, of which every value checks the whole row; wider rows are checked once, by an earlier launch.
 const NARROW: usize = 4;
 /// The bits of [`GRADIENT_LIMIT`].
 const LIMIT_BITS: u32 = GRADIENT_LIMIT.to_bits();
@@ -22,7 +22,7 @@ fn is_sound(gradient: f32) -> bool {
 
 /// Whether the row is wanted and its gradient is sound.
 #[cube]
-fn moves_row(grad: &[f32], visible: &[i32], row: usize, width: u32, #[comptime] masked: bool) -> bool {
+fn row_is_updated(grad: &[f32], visible: &[i32], row: usize, width: u32, #[comptime] masked: bool) -> bool {
     let mut wanted = true;
     if comptime!(masked) {
         wanted = visible[row] != 0;
@@ -34,24 +34,24 @@ fn moves_row(grad: &[f32], visible: &[i32], row: usize, width: u32, #[comptime] 
     wanted && sound
 }
 
-/// moves`[row]` is 1 where the row moves.
+/// updated`[row]` is 1 where the row is updated, else 0.
 #[cube(launch)]
-fn rows_that_move(grad: &[f32], visible: &[i32], moves: &mut [u32], width: u32, #[comptime] masked: bool) {
+fn mark_rows(grad: &[f32], visible: &[i32], updated: &mut [u32], width: u32, #[comptime] masked: bool) {
     let row = ABSOLUTE_POS;
-    if row < moves.len() {
-        let own = moves_row(grad, visible, row, width, masked);
-        moves[row] = select(own, 1u32, 0u32);
+    if row < updated.len() {
+        let own = row_is_updated(grad, visible, row, width, masked);
+        updated[row] = select(own, 1u32, 0u32);
     }
 }
 
-/// Moves all values of the rows that move: those of `moves`, or of narrow rows what they find themselves.
+/// Updates the rows that `row_is_updated` selects. For wide rows `updated` holds its result; every value of a narrow row calls it.
 #[cube(launch)]
-fn move_rows(
+fn update_rows(
     param: &mut [f32],
     m: &mut [f32],
     v: &mut [f32],
     grad: &[f32],
-    moves: &[u32],
+    updated: &[u32],
     visible: &[i32],
     width: u32,
     beta1: f32,
@@ -67,7 +67,7 @@ fn move_rows(
     let at = ABSOLUTE_POS;
     if at < param.len() {
         let row = at / width as usize;
-        let own = if comptime!(narrow) { moves_row(grad, visible, row, width, masked) } else { moves[row] != 0 };
+        let own = if comptime!(narrow) { row_is_updated(grad, visible, row, width, masked) } else { updated[row] != 0 };
         if own {
             let g = grad[at];
             let first = beta1 * m[at] + one_minus_beta1 * g;
@@ -90,16 +90,16 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
     let grad = into_contiguous(grad);
     let client = grad.client.clone();
     let (narrow, masked) = (width as usize <= NARROW, visible.is_some());
-    // What is not read needs a buffer of its kind.
+    // Arrays that are not read need a buffer of their type.
     let nothing = || constant(&grad, &[0i32], DType::I32);
     let visible = visible.map_or_else(nothing, into_contiguous);
-    let moves = if narrow { constant(&grad, &[0u32], DType::U32) } else { super::tensor::empty(&grad, [rows], DType::U32) };
+    let updated = if narrow { constant(&grad, &[0u32], DType::U32) } else { super::tensor::empty(&grad, [rows], DType::U32) };
     let dim = CubeDim::new_1d(THREADS);
     if !narrow {
         let (g, seen) = (grad.clone().into_buffer_arg(), visible.clone().into_buffer_arg());
-        rows_that_move::launch(&client, workgroups_for(rows), dim, g, seen, moves.clone().into_buffer_arg(), width, masked);
+        mark_rows::launch(&client, workgroups_for(rows), dim, g, seen, updated.clone().into_buffer_arg(), width, masked);
     }
-    move_rows::launch(
+    update_rows::launch(
         &client,
         workgroups_for(n),
         dim,
@@ -107,7 +107,7 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
         m.clone().into_buffer_arg(),
         v.clone().into_buffer_arg(),
         grad.into_buffer_arg(),
-        moves.into_buffer_arg(),
+        updated.into_buffer_arg(),
         visible.into_buffer_arg(),
         width,
         s.beta1,

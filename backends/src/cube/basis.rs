@@ -1,4 +1,4 @@
-//! Combinations of shared functions on the device.
+//! Combinations of basis functions on the device.
 
 use super::field::add_segments;
 use super::tensor::{THREADS, constant, floats, workgroups_for};
@@ -14,19 +14,19 @@ use std::sync::Arc;
 /// Rows over which one thread sums a function's gradient.
 const SEGMENT: usize = 128;
 
-/// Words per output in a plan.
+/// Words per output in a plan. The following constants are the indices of the words.
 const FIELDS: usize = 6;
-/// Where its coefficients start in a row.
+/// First coefficient of the output in a row.
 const COEFFICIENT: usize = 0;
-/// Where its functions start.
+/// First function of the output.
 const FUNCTION: usize = 1;
-/// How many functions it combines.
+/// Number of functions that the output combines.
 const COUNT: usize = 2;
-/// Outputs of the heads before its own.
+/// Number of outputs of all heads before that of the output.
 const BEFORE: usize = 3;
-/// Outputs of its own head.
+/// Number of outputs of its head.
 const OUTPUTS: usize = 4;
-/// Its index among them.
+/// Index of the output in its head.
 const INDEX: usize = 5;
 
 /// The words of every output.

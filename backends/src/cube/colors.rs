@@ -9,7 +9,7 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Pixels per thread in sums, and threads of a workgroup there.
+/// Pixels per thread, and threads per workgroup, of the kernels that sum over pixels.
 const PER_THREAD: usize = 8;
 const SUMMING: usize = 64;
 

@@ -13,10 +13,10 @@ use cubecl::prelude::*;
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use std::thread::ThreadId;
 
-/// Upper bound on the bytes of images that stay on devices.
+/// Upper bound on the bytes of images that are cached on devices.
 const MOST_KEPT: usize = 512 << 20;
 
-/// Images by thread (a thread has its own stream of launches) and device.
+/// Cached images by thread (each has its own stream of launches) and device.
 static KEPT: LazyLock<Mutex<KeptImages<(ThreadId, CubeDevice), CubeTensor>>> = LazyLock::new(|| Mutex::new(KeptImages::new(MOST_KEPT)));
 
 /// Byte `at` of words that hold four each, lowest first, as 0..1.
@@ -78,8 +78,8 @@ impl ImageOps for CubeBackend {
             let words = like.client.create_from_slice(if padded.is_empty() { &image.data } else { &padded });
             CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), [count].into(), words, DType::U32)
         };
-        let place = (std::thread::current().id(), like.device.clone());
-        let words = KEPT.lock().unwrap_or_else(PoisonError::into_inner).of(place, &image, send);
+        let owner = (std::thread::current().id(), like.device.clone());
+        let words = KEPT.lock().unwrap_or_else(PoisonError::into_inner).of(owner, &image, send);
         let client = like.client.clone();
         let (w, b) = (words.into_buffer_arg(), constant(&like, &background, DType::F32).into_buffer_arg());
         let pixels = width * height;

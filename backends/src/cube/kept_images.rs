@@ -1,19 +1,19 @@
-//! Images that stay in the memory of a device: a training reads each of them many times, and sending it takes longer than unpacking it.
+//! A cache of images in device memory: training reads each image many times, and uploading it takes longer than unpacking it.
 
 use cc4dgs_core::Image8;
 use std::collections::HashMap;
 use std::hash::Hash;
 use std::sync::{Arc, Weak};
 
-/// What a device made of an image.
+/// A cached value of an image.
 struct Entry<T> {
-    /// Keeps the address of the image from being used again.
+    /// Keeps the allocation, so that no other image gets the same address.
     image: Weak<Image8>,
     bytes: usize,
     made: T,
 }
 
-/// What was made of images, by the place it is used in (`K`: a thread and a device) and the image's address. An entry lasts as long as somebody else has the image.
+/// Values made of images, by owner (`K`: a thread and a device) and address of the image. Entries whose image was dropped are removed at the next miss.
 pub struct KeptImages<K, T> {
     most_bytes: usize,
     bytes: usize,
@@ -21,14 +21,14 @@ pub struct KeptImages<K, T> {
 }
 
 impl<K: Eq + Hash, T: Clone> KeptImages<K, T> {
-    /// Keeps up to `most_bytes` of images.
+    /// A cache for images of up to `most_bytes` together.
     pub fn new(most_bytes: usize) -> Self {
         Self { most_bytes, bytes: 0, entries: HashMap::new() }
     }
 
-    /// What `make` made of `image` for `place`. It is made again where there was no space for it. What was made of images that nobody has any more goes first.
-    pub fn of(&mut self, place: K, image: &Arc<Image8>, make: impl FnOnce() -> T) -> T {
-        let key = (place, Arc::as_ptr(image) as usize);
+    /// The cached value of `image` for `owner`, or else the result of `make`, which is cached if its image fits within the bound.
+    pub fn of(&mut self, owner: K, image: &Arc<Image8>, make: impl FnOnce() -> T) -> T {
+        let key = (owner, Arc::as_ptr(image) as usize);
         if let Some(entry) = self.entries.get(&key) {
             return entry.made.clone();
         }
@@ -65,10 +65,10 @@ mod tests {
         for _ in 0..2 {
             assert_eq!(images.each_ref().map(|image| ask(&mut kept, image)), [1, 2, 3]);
         }
-        assert_eq!(made, 4, "the third has no space and is made each time");
+        assert_eq!(made, 4, "the third is over the bound and is made each time");
         let [one, two, three] = images;
         drop(one);
-        assert_eq!((kept.of("device", &three, || 30), kept.of("device", &three, || 31)), (30, 30), "the space of the first");
+        assert_eq!((kept.of("device", &three, || 30), kept.of("device", &three, || 31)), (30, 30), "the bytes of the first are free again");
         assert_eq!((kept.of("device", &two, || 20), kept.of("other device", &two, || 21)), (2, 21));
         assert_eq!(kept.bytes, 24);
     }

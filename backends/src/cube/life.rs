@@ -45,7 +45,7 @@ struct Life {
     /// Share of the opacity that does not depend on time, and the rest.
     gate: f32,
     rest: f32,
-    /// The rest, but 0 up to [`LASTING`].
+    /// 1 - gate, but 0 where it is at most [`LASTING`].
     temporary: f32,
     half_width: f32,
     falloff: f32,

@@ -53,10 +53,10 @@ pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> 
     CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), Shape::from([values.len()]), buffer, dtype)
 }
 
-/// Upper bound on the bytes of a constant that is kept, and of all of them together.
+/// Upper bound on the bytes of a cached constant, and of all of them together.
 const LARGEST_KEPT: usize = 64 << 10;
 const MOST_KEPT: usize = 8 << 20;
-/// Bytes that a constant is taken to need besides its values: at most 8,192 are kept, however small they are.
+/// Bytes counted per cached constant besides its values: at most 8,192 constants are cached, however small they are.
 const OVERHEAD: usize = 1 << 10;
 
 /// Constants by thread (a thread has its own stream of launches), device and type, and how many bytes they have.
@@ -182,7 +182,7 @@ pub fn compensated_sum(sum: f32, lost: f32, value: f32) -> (f32, f32) {
 /// sum, the others 0. All threads of the workgroup must call it.
 #[cube]
 pub fn sum_of_threads(values: &mut Shared<[f32]>, own: f32) -> f32 {
-    // What an earlier call left in `values` has been read.
+    // Wait until the values of an earlier call have been read.
     sync_cube();
     values[UNIT_POS as usize] = own;
     sync_cube();

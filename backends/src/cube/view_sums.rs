@@ -37,7 +37,7 @@ fn fade_shown(logits: &[f32], radii: &[i32], out: &mut [f32], share: f32) {
     let row = ABSOLUTE_POS;
     if row < radii.len() {
         let logit = logits[row];
-        // What is not a number stays so, and density control removes it.
+        // NaN stays NaN, and density control removes the Gaussian.
         let below = select(logit > MOST_LOGIT, MOST_LOGIT, logit);
         let bounded = select(below < -MOST_LOGIT, -MOST_LOGIT, below);
         let faded = ((1.0 - share) / ((-bounded).exp() + share)).ln();

@@ -7,7 +7,7 @@ use burn::backend::{Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
 
-/// Gradients have to be smaller than this. The square of one from 1.8e19 on is infinite in float32, and so would its second moment be for ever.
+/// Gradients have to be smaller than this. The square of one from 1.8e19 on is infinite in float32, and then its second moment would stay infinite.
 pub const GRADIENT_LIMIT: f32 = 1e18;
 
 /// The settings of one step.
@@ -23,7 +23,7 @@ pub struct AdamSettings {
     pub epsilon: f64,
     /// Number of this step, from 1; sets the bias corrections.
     pub step: u64,
-    /// One entry per row (dimension 0); rows with 0 are left alone, moments included (selective Adam of gsplat). A rasterizer's radii serve as they are.
+    /// One entry per row (dimension 0); rows with 0 are unchanged, moments included (selective Adam of gsplat). The radii of a rasterizer can be passed.
     pub visible: Option<Tensor<1, Int>>,
 }
 
@@ -53,10 +53,10 @@ pub struct AdamScalars {
     pub epsilon: f32,
 }
 
-/// What a step leaves behind.
+/// The result of a step.
 #[derive(Clone, Debug)]
 pub struct AdamStep<const D: usize> {
-    /// The parameters, moved.
+    /// The parameters after the step.
     pub param: Tensor<D>,
     /// First moment.
     pub m: Tensor<D>,
@@ -69,7 +69,7 @@ type Moved<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>);
 /// The operations per device: `(param, m, v)`.
 #[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait AdamOps: Backend {
-    /// Moves `param` by one step; all four float tensors have one shape.
+    /// Updates `param` by one step; all four float tensors have one shape.
     fn adam(
         param: FloatTensor<Self>,
         m: FloatTensor<Self>,

@@ -42,7 +42,7 @@ impl BasisShape {
     }
 }
 
-/// What the combinations of the same coefficients leave for their gradient.
+/// What combinations of the same coefficients save for the gradient of the coefficients.
 #[derive(Debug)]
 pub struct Combinations {
     shape: Arc<BasisShape>,

@@ -100,7 +100,7 @@ pub fn beside(parts: [Tensor<2>; PARTS]) -> Tensor<2> {
     let rows = parts[0].dims()[0];
     let agree = parts.iter().all(|part| part.dims()[0] == rows);
     if rows == 0 || !agree {
-        // burn says what does not agree.
+        // Their numbers of rows differ: burn's own concatenation reports it.
         return Tensor::cat(parts.into(), 1);
     }
     let [a, b, c, d, e] = parts.map(Tensor::into_dispatch);

@@ -23,7 +23,7 @@ pub struct GridBox {
     pub resolution: u32,
 }
 
-/// What the first half leaves for the second.
+/// The result of the first half, for the second.
 #[derive(Clone, Debug, ExtensionType)]
 pub struct CornersBegun<B: Backend> {
     /// Trilinear weights `[8M]`.
@@ -89,7 +89,7 @@ impl<B: CpuBackend> CornerOps for B {
 }
 
 /// Upper bound on the vertices of a level that are allocated without counting them: with 32 features each, they fit the bindings of every adapter. For more
-/// of them, waiting costs little beside decoding.
+/// vertices, the time of reading the count back is small beside that of decoding.
 const MOST_UNCOUNTED: usize = 1 << 20;
 
 /// The grid corners of M points on one level.

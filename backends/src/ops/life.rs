@@ -2,8 +2,8 @@
 //!
 //! A life has a centre T, a half-width r during which the Gaussian is fully there, a falloff s, a gate g and a velocity v (FreeTimeGS, with the gate of
 //! FreeTimeGS++ and the flat-topped life of SharpTimeGS). At the time t the Gaussian is shifted by v (t - T) and its opacity is multiplied by
-//! g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2). Where g is 1 in float32, 1 - g is 0: such a life has no gradient but that of its gate, and a velocity that is
-//! multiplied by 1 - g none either.
+//! g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2). Where g is 1 in float32, 1 - g is 0: then T, r and s have no
+//! gradient, and neither has a velocity that is multiplied by 1 - g.
 
 use super::limits::check_binding;
 use super::split::split;
@@ -27,10 +27,10 @@ pub const OUTPUTS: usize = 4;
 pub const LEAST_FALLOFF: f32 = 1e-3;
 /// Logarithm of the opacity factor of a hidden Gaussian.
 pub const HIDDEN: f32 = -30.0;
-/// Up to here, 1 - g is 0 beside a gate that is 1 in float32: what lasts has neither a life nor, where it is gated, a velocity. Adam moves any attribute with
-/// a gradient at its full rate, however small the gradient is.
+/// Values of 1 - g up to this count as 0, because g is 1 in float32: T, r, s and a gated velocity then have no gradient. Otherwise Adam would move them at its
+/// full rate, however small their gradient is.
 pub(crate) const LASTING: f32 = f32::EPSILON / 4.0;
-/// Largest logarithm of r and s: further ones last for ever too.
+/// Upper bound on the logarithms of r and s; at this bound a life covers any sequence.
 pub(crate) const MOST_LOG: f32 = 60.0;
 
 /// Times, and how lives are applied.
@@ -40,7 +40,7 @@ pub struct LifeRules {
     pub times_norm: Vec<f32>,
     /// A Gaussian whose opacity factor is below this is hidden: [`HIDDEN`], without a gradient.
     pub hidden_below: f32,
-    /// Whether velocities are multiplied by 1 - g, so that what lasts is not moved by its velocity, which then has no gradient.
+    /// Whether velocities are multiplied by 1 - g, so that a Gaussian that is visible at all times is not moved by its velocity, which then has no gradient.
     pub gated_velocity: bool,
 }
 

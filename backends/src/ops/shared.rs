@@ -1,7 +1,7 @@
-//! Gradients that several uses of a tensor work out together.
+//! One gradient for several uses of a tensor.
 //!
-//! burn adds what the uses of a tensor return, one after the other, and each addend is as large as the tensor. Here every use leaves what it knows, returns a
-//! token of one float in place of a gradient, and the gradient is computed once, when all uses are done.
+//! burn adds the gradients that the uses of a tensor return, one after the other, and each is as large as the tensor. Here every use stores its part of the
+//! state, returns a token of one float in place of a gradient, and the gradient is computed once, when all uses are done.
 
 use super::autodiff::{differentiate, record};
 use crate::cpu::tensor::CpuBackend;
@@ -15,7 +15,7 @@ use std::fmt::{Debug, Formatter};
 use std::marker::PhantomData;
 use std::sync::{Mutex, PoisonError};
 
-/// What the uses of a tensor leave, by their index.
+/// The parts that the uses of a tensor have stored, by index of the use.
 pub struct Shared(Mutex<Vec<Option<Box<dyn Any + Send>>>>);
 
 impl Debug for Shared {
@@ -25,17 +25,17 @@ impl Debug for Shared {
 }
 
 impl Shared {
-    /// For `uses` uses.
+    /// Space for the parts of `uses` uses.
     pub(super) fn new(uses: usize) -> Self {
         Self(Mutex::new((0..uses).map(|_| None).collect()))
     }
-    /// Leaves what the use `index` knows.
+    /// Stores the part of the use `index`.
     pub(super) fn leave<T: Send + 'static>(&self, index: usize, value: T) {
         if let Some(slot) = self.0.lock().unwrap_or_else(PoisonError::into_inner).get_mut(index) {
             *slot = Some(Box::new(value));
         }
     }
-    /// Takes what was left, in the order of the uses; `None` for a use that the loss does not depend on.
+    /// Takes the stored parts, in the order of the uses; `None` for a use that the loss does not depend on.
     pub(super) fn take<T: 'static>(&self) -> Vec<Option<T>> {
         let mut slots = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         slots.iter_mut().map(|slot| slot.take().and_then(|value| value.downcast().ok()).map(|value| *value)).collect()
@@ -61,7 +61,7 @@ impl Token for burn_cubecl::CubeBackend {
     }
 }
 
-/// The derivative of a tensor with shared uses: a function of what they left.
+/// The derivative of a tensor with shared uses: a function of their stored parts.
 #[derive(Debug)]
 struct Collect<S>(PhantomData<fn() -> S>);
 
@@ -73,7 +73,7 @@ impl<B: Backend, S: Clone + Send + Debug + 'static> Backward<B, 1> for Collect<S
     }
 }
 
-/// `tensor` itself, whose gradient is `gradient` of `state` once all its uses are done. Every use of what is returned must leave its part and return a [`Token`].
+/// `tensor` itself, whose gradient is `gradient` of `state` once all its uses are done. Every use of the result must store its part and return a [`Token`].
 pub(super) fn share<B: Backend, C: CheckpointStrategy, S: Clone + Send + Debug + 'static>(
     tensor: FloatTensor<Autodiff<B, C>>,
     state: S,

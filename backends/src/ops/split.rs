@@ -1,4 +1,4 @@
-//! A flat tensor cut into pieces, whose gradient is put together once.
+//! A flat tensor that is split into pieces. Its gradient is assembled once.
 //!
 //! Slices would do the same, but the derivative of each is a tensor of zeros as large as the whole.
 //!
@@ -16,7 +16,7 @@ use burn::backend::{Autodiff, Backend, Dispatch, backend_extension};
 use burn::tensor::{Slice, Tensor};
 use std::sync::Arc;
 
-/// The layout of the whole, and the gradients of its pieces as far as they are known.
+/// The layout of the whole tensor, and the gradients of its pieces as far as they are known.
 #[derive(Debug)]
 pub struct Pieces {
     /// How the pieces lie in the whole.
@@ -59,16 +59,16 @@ impl PieceLayout {
     }
 }
 
-/// Putting pieces together, per device.
+/// Assembly of pieces, per device.
 pub trait SplitBackward: Token {
-    /// The whole of which these are the pieces; zeros in place of those that are `None`.
+    /// The whole tensor of these pieces; zeros for those that are `None`.
     fn join(pieces: Vec<Option<FloatTensor<Self>>>, layout: &PieceLayout) -> FloatTensor<Self>;
 }
 
 /// The operations per device.
 #[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait SplitOps: Backend {
-    /// `flat` itself; its gradient is that of its pieces, put together.
+    /// `flat` itself; its gradient consists of those of its pieces.
     fn whole(flat: FloatTensor<Self>, pieces: Arc<Pieces>) -> FloatTensor<Self>;
     /// The piece `index`, flat, of a tensor that [`SplitOps::whole`] returned.
     fn piece(whole: FloatTensor<Self>, pieces: Arc<Pieces>, index: usize) -> FloatTensor<Self>;

@@ -1,4 +1,4 @@
-//! What density control sums over views, for N Gaussians in one pass. With burn's operations it is some thirty passes per view, each on one thread.
+//! The sums over views that density control needs, for N Gaussians in one pass. burn's own operations take some thirty passes per view, each on one thread.
 
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::view_sums as kernel;
@@ -7,7 +7,7 @@ use burn::backend::{Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
 
-/// Bound on the opacity logits that fade: from 17 on their sigmoid is 1 in float32, and e^89 is infinite.
+/// Bound on the opacity logits that [`fade`] reads: from 17 on their sigmoid is 1 in float32, and e^89 is infinite.
 pub(crate) const MOST_LOGIT: f32 = 30.0;
 
 /// The operations per device. A Gaussian whose radius is 0 is not shown.
@@ -74,7 +74,7 @@ pub fn add_weights(sums: Tensor<2>, radii: Tensor<1, Int>, weights: Tensor<1>) -
     Ok(Tensor::from_dispatch(<Dispatch as ViewSumOps>::add_weights(sums, radii.inner().into_dispatch(), weights)))
 }
 
-/// Opacity `logits` `[N]` after views with these `radii`: the opacity of what is shown is smaller by `share` (0..1), all others are unchanged.
+/// Opacity `logits` `[N]` after views with these `radii`: the opacity of Gaussians that are shown is smaller by `share` (0..1), all others are unchanged.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other shapes.

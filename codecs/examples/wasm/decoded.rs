@@ -4,7 +4,7 @@ use cc4dgs_format::archive::Archive;
 use cc4dgs_format::{HostGaussians, Limits, Result, Silent, canonical_stages, read_gaussians, read_stage, read_weights};
 use xxhash_rust::xxh3::Xxh3;
 
-/// XXH3-64 over the bits of all Gaussians of an archive, of what a player draws at each stage of their arrival, and of all weights.
+/// XXH3-64 over the bits of all Gaussians of an archive, of what a player draws at each stage of loading, and of all weights.
 pub fn checksum(bytes: Vec<u8>) -> Result<u64> {
     cc4dgs_codecs::link();
     let (object, limits) = ("archive", Limits::default());

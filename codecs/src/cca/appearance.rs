@@ -156,7 +156,7 @@ fn autoencode(gaussians: &HostGaussians, known: &HostGaussians, profile: &Profil
     let target = Target { bits: profile.latent_bits, mu_law: false, loss: f64::INFINITY, tail: LATENT_TAIL };
     let columns: Vec<Column> = split(&train::encode_all(&data, &encoder), latent).par_iter().map(|c| column::encode(c, target)).collect();
 
-    // From here on only what the decoder has: half-precision weights, dequantised latents, conditions.
+    // From here on only values that the decoder has, too: half-precision weights, dequantised latents, conditions.
     let network = Decoder::new(width, &decoder.iter().map(|w| w.to_f32()).collect::<Vec<_>>());
     let z = interleave(&columns.iter().map(|c| column::dequantise(c, known.len())).collect::<Vec<_>>(), known.len());
     let base = reconstruct(&network, &statistics, &normalisation, known, &z, None);

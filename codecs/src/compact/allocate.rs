@@ -1,5 +1,5 @@
-//! Steps of the columns relative to each other, from what a change of each costs and saves: at the best ratio all columns give the same bytes for the same
-//! error of images. Derivatives give the steps to start with; this corrects for what they leave out, such as large steps and prediction.
+//! Steps of the columns relative to each other, from the error and the bytes that a change of each gives: at the best ratio all columns give the same bytes
+//! for the same error of images. Derivatives give the first steps; this corrects for what derivatives leave out, such as large steps and prediction.
 
 use super::bytes_of;
 use super::images::Images;
@@ -12,7 +12,7 @@ use std::ops::RangeInclusive;
 /// Views on which the error is measured, by [`budget`].
 const VIEWS: RangeInclusive<usize> = 4..=8;
 const WORK: usize = 1_000_000;
-/// The change of a step that is tried.
+/// The factor by which a step is changed to measure its effect.
 const CHANGE: f64 = 2.0;
 /// Largest factor, and the inverse of the smallest.
 const LARGEST: f64 = 8.0;

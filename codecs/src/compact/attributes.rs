@@ -21,14 +21,14 @@ const STEP_OF_TOLERANCE: f64 = 1.99;
 const STEP_OF_REST: f64 = 1.999_999;
 /// Largest error of a number that is rounded to float32, over the number.
 const ROUNDING: f64 = 1.0 / (1u64 << 24) as f64;
-/// Shifts are at most this.
+/// Upper bound on shifts: how many times the step of a row is doubled.
 const MOST_SHIFT: u8 = 15;
 
 /// How an attribute is coded.
 pub struct Coding {
     pub name: String,
     growth: Growth,
-    /// Rows of larger shifts have this one.
+    /// Upper bound on the shifts of this attribute.
     limit: u8,
     /// Step of rows whose shift is 0.
     step: f32,
@@ -169,8 +169,8 @@ impl<'a> Coded<'a> {
     }
 }
 
-/// The largest step with which the stored rows of an attribute are within `tolerance`. It is not above 0 where none is small enough, because rounding to
-/// float32 alone may change large values by as much.
+/// The largest step with which the stored rows of an attribute are within `tolerance`; 0 or less if there is none, because rounding to float32 alone changes
+/// large values by as much.
 fn largest_step(attribute: &ExtraAttribute, rows: &[bool], tolerance: f64) -> f64 {
     let stored = attribute.values.chunks_exact(attribute.width.max(1)).zip(rows).filter(|(_, stored)| **stored);
     let largest = stored.flat_map(|(row, _)| row).fold(0.0f32, |largest, v| largest.max(v.abs()));
@@ -178,7 +178,7 @@ fn largest_step(attribute: &ExtraAttribute, rows: &[bool], tolerance: f64) -> f6
     (STEP_OF_TOLERANCE * tolerance).min(STEP_OF_REST * (tolerance - rounding))
 }
 
-/// What predicts a column of a row: its classes, and the columns before.
+/// The inputs of the prediction of a column of a row: its classes, and the earlier columns.
 fn known(color: u8, shape: u8, shift: u8, column: usize, before: impl Fn(usize) -> i32) -> Known {
     let mut out = Known { classes: [color, shape], class: shape, shift, ..Default::default() };
     for (given, k) in out.given.iter_mut().zip((column.saturating_sub(GIVEN)..column).rev()) {
@@ -240,7 +240,7 @@ pub fn complete(set: &StreamSet, shape: &Shape) -> bool {
     shape.extra.iter().all(|attribute| plain(attribute) || coded(attribute))
 }
 
-/// What the rows of attributes depend on.
+/// Facts about the rows, on which the decoding of attributes depends.
 pub struct RowFacts<'a> {
     pub geometry: &'a Geometry,
     pub classes: &'a [u8],

@@ -25,7 +25,7 @@ const NOTHING: i32 = -1;
 const ONE_STEP: i32 = 128;
 /// Mean magnitude of a coordinate over its root mean square.
 const MEAN: f64 = 0.7;
-/// What a bit costs, in squared steps, at the rate where less of either is worth the same: (ln 2)/6.
+/// The price of a bit in squared steps, at the rate where error and bits are in balance: (ln 2)/6.
 const BIT: f64 = 0.1155;
 /// Largest share of a step by which a coordinate is rounded towards zero.
 const FARTHEST: f64 = 0.4;
@@ -283,7 +283,7 @@ impl Degree {
         }
         let largest = self.spread.iter().copied().max().unwrap_or(0);
         let levels: Vec<usize> = self.spread.iter().map(|&s| usize::from((largest - s) / 2).min(LEVELS - 1)).collect();
-        // Symbols first: contexts depend on them alone, so that they need not wait for the bits behind them.
+        // Symbols first: contexts depend on symbols alone, so that decoding a symbol need not wait for low bits and signs.
         let mut symbols = vec![0u8; filled.len() * dims];
         if C::WRITES {
             for (symbols, &(row, _)) in symbols.chunks_exact_mut(dims).zip(&filled) {

@@ -1,4 +1,4 @@
-//! Columns of Gaussians that are read where they are: an encoder changes few of them, and copies of the others would take most of its memory.
+//! Borrowed columns of Gaussians: an encoder changes few of them, and copies of the others would take most of its memory.
 
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::storage::Shape;
@@ -6,7 +6,7 @@ use cc4dgs_format::{ExtraAttribute, HostGaussians};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// The columns of [`HostGaussians`], each of which may be that of others.
+/// The columns of [`HostGaussians`], borrowed; they may belong to different values.
 #[derive(Clone, Copy)]
 pub struct Columns<'a> {
     pub sh_degree: usize,
@@ -58,7 +58,7 @@ impl<'a> Columns<'a> {
         let shapes = [(self.means, 3), (self.log_scales, 3), (self.quaternions, 4), (self.opacity_logits, 1)];
         shapes.into_iter().map(|(values, width)| Rows::of(values, width)).chain((0..=self.sh_degree).map(move |degree| self.coefficients(degree)))
     }
-    /// A copy, for those who need Gaussians.
+    /// A copy as `HostGaussians`.
     pub fn to_host(self) -> HostGaussians {
         HostGaussians {
             sh_degree: self.sh_degree,
@@ -78,7 +78,7 @@ impl<'a> Columns<'a> {
 #[derive(Clone, Copy)]
 pub struct Rows<'a> {
     column: &'a [f32],
-    /// Values from one row of the column to the next, and those before the ones that count.
+    /// Distance from one row of the column to the next, and offset of the values within it.
     width: usize,
     first: usize,
     /// Values of a row.

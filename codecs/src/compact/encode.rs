@@ -127,7 +127,7 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
         return (vec![0; weights.len()], 1.0);
     }
     if !adaptive {
-        // One step for all that costs as much error as steps of their own would.
+        // One step for all Gaussians, with the same total error as individual steps.
         return (vec![0; weights.len()], (sorted.iter().map(|w| w * w).sum::<f64>() / sorted.len() as f64).sqrt());
     }
     let top = top.unwrap_or_else(|| {
@@ -153,11 +153,11 @@ impl Plan {
     fn choices_of(&self, degree: usize) -> Choices {
         Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices }
     }
-    /// Whether `other`, of the same planner, gives the coefficients of a degree the same codes where degrees are rounded apart.
+    /// Whether `other`, of the same planner, gives the coefficients of a degree the same codes where degrees are rounded independently.
     fn rounds_alike(&self, other: &Self, degree: usize) -> bool {
         self.degrees.get(degree) == other.degrees.get(degree) && self.rounds_degree(degree) == other.rounds_degree(degree)
     }
-    /// The directions for which colours are rounded together, of those that there are.
+    /// `directions` if colours are rounded together, else `None`.
     fn together<'a>(&self, directions: Option<&'a Directions>) -> Option<&'a Directions> {
         directions.filter(|_| self.joint)
     }
@@ -165,7 +165,7 @@ impl Plan {
     pub fn keeps_colors(&self, before: &Self, directions: Option<&Directions>) -> Vec<bool> {
         let together = self.together(directions).is_some();
         let mut keeps: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds_alike(before, degree)).collect();
-        // Together, a degree makes up for the errors of those above it.
+        // Rounded together, a degree compensates for the errors of higher degrees.
         if before.together(directions).is_some() != together || together && keeps.contains(&false) {
             keeps.fill(false);
         }
@@ -208,11 +208,11 @@ impl Plan {
         let opacities = rounds(3) && (own.opacity_step, own.opacity_limit) == (other.opacity_step, other.opacity_limit);
         [means, scales, quaternions, opacities]
     }
-    /// The integers of canonical Gaussians, as many as those that were planned for, whose `colors` have been rounded.
+    /// The integers of canonical Gaussians, whose number is that of the planned ones and whose `colors` have been rounded.
     pub fn quantise<'a>(&'a self, gaussians: Columns, free: &[bool], classes: &'a Classes, colors: Vec<Codes>) -> Integers<'a> {
         self.quantise_after(gaussians, free, classes, colors, None)
     }
-    /// The same after those of another plan of the same planner: what this one keeps of them ([`Plan::keeps_shapes`]) is not rounded again.
+    /// As [`Plan::quantise`], given the integers of another plan of the same planner: those that it keeps ([`Plan::keeps_shapes`]) are not rounded again.
     pub fn quantise_after<'a>(
         &'a self,
         gaussians: Columns,
@@ -283,7 +283,7 @@ mod tests {
         let kept = |directions: Option<&Directions>, largest: [f64; 6], joint: bool| -> Vec<bool> {
             let before = plan(all, true);
             let mut codes = before.color_codes(columns, &classes, directions, None);
-            // What is kept can be told from what is rounded again.
+            // Marks the known codes, so that kept ones differ from those that are rounded again.
             codes.iter_mut().for_each(|codes| codes.values[0] += 1000);
             let wanted: Vec<i32> = codes.iter().map(|codes| codes.values[0]).collect();
             let next = plan(largest, joint);
@@ -307,7 +307,7 @@ mod tests {
     #[test]
     fn shapes_are_kept_where_a_plan_rounds_them_as_the_one_before() {
         let mut g = random_gaussians(80, 0);
-        // Rows that no step can hold.
+        // Rows with values that no step can represent.
         (g.means[4], g.log_scales[7], g.opacity_logits[9]) = (f32::MAX, 80.0, 70.0);
         g.quaternions[..4].fill(100.0);
         let columns = Columns::from(&g);
@@ -328,7 +328,7 @@ mod tests {
             let found = next.quantise_after(columns, &[false; 80], &classes, Vec::new(), Some((plan([1.0; 6]), parts)));
             let afresh = next.quantise(columns, &[false; 80], &classes, Vec::new());
             assert!(integers(&found) == integers(&afresh), "{largest:?}");
-            // What is kept can be told from what is rounded again.
+            // Marks the known codes, so that kept ones differ from those that are rounded again.
             parts = found.into_parts();
             (parts.keys[0], parts.scales[0][0], parts.rotations[0].norm, parts.opacities[0]) = (u64::MAX, 1234, 1234, 1234);
             let found = next.quantise_after(columns, &[false; 80], &classes, Vec::new(), Some((before, parts)));

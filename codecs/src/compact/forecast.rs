@@ -25,7 +25,7 @@ pub struct Forecast {
 }
 
 impl Forecast {
-    /// Before the first round, where rounding costs `untuned` dB without training and rounds have so many iterations.
+    /// The forecast before the first round. Rounding costs `untuned` dB without training; a round has `iterations` iterations.
     pub fn new(untuned: f64, iterations: f64) -> Self {
         let cost = REMAINS * untuned.max(1e-6);
         let hundreds = 0.01 * iterations;

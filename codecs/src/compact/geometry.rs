@@ -173,7 +173,7 @@ pub fn nearest(value: f64) -> i32 {
     const WHOLE: f64 = (1u64 << 52) as f64;
     let magnitude = value.abs();
     let shifted = magnitude + WHOLE;
-    // That has rounded halves to even numbers.
+    // The addition has rounded halves to even.
     let up = if magnitude - (shifted - WHOLE) >= 0.5 { 1.0 } else { 0.0 };
     // The low bits of the mantissa.
     let code = (shifted + up).to_bits() as i32;
@@ -226,7 +226,7 @@ impl Rotation {
     pub fn quaternion(&self, step: f64) -> [f32; 4] {
         let v = self.codes.map(|code| f64::from(code) * step);
         let squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
-        // Rounded outwards, nothing may be left for the largest.
+        // The rounded components may leave nothing for the largest one.
         let scale = if squared > 0.999 { (0.999 / squared).sqrt() } else { 1.0 };
         let largest = (1.0 - squared * scale * scale).max(0.0).sqrt();
         let norm = if self.norm == 0 { 1.0 } else { libm::exp(f64::from(self.norm) * NORM_STEP) };

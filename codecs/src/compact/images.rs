@@ -1,4 +1,4 @@
-//! How much images change with the Gaussians that are drawn, and how much they differ from those that were recorded.
+//! Differences between images of original and changed Gaussians, and between rendered and recorded images.
 
 use cc4dgs_format::{Camera, HostGaussians, RenderModel, Result, TrainingViews};
 
@@ -8,12 +8,12 @@ pub struct Recorded<'a> {
     renderer: &'a dyn RenderModel,
     /// Colours `[3,H,W]` of each view.
     truths: Vec<Vec<f32>>,
-    /// What the views are called in messages.
+    /// The name of the views in messages.
     pub kind: &'static str,
 }
 
 impl<'a> Recorded<'a> {
-    /// The images of `chosen` of the views, which must have so many.
+    /// The images of `chosen` of the views; there must be as many.
     pub fn of(views: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize) -> Result<Self> {
         let index = |k: usize| k * views.len() / chosen;
         let truths = (0..chosen).map(|k| Ok(views.image(index(k))?.to_planes(renderer.background()))).collect::<Result<Vec<_>>>()?;
@@ -64,7 +64,7 @@ impl<'a> Images<'a> {
     pub fn error(&self, changed: HostGaussians) -> Result<f64> {
         self.error_of(changed, |v| v)
     }
-    /// The same of colours that are `shown` as.
+    /// [`Images::error`] after the map `shown` of colours.
     fn error_of(&self, changed: HostGaussians, shown: impl Fn(f32) -> f32) -> Result<f64> {
         let mut error = 0.0;
         self.renderer.render_views_once(changed, &self.views, &mut |k, drawn| {

@@ -92,7 +92,7 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
         let (middle, largest) = sizes(&gaussians.log_scales[3 * i..3 * i + 3]);
         let alpha = 1.0 / (1.0 + libm::exp(-f64::from(gaussians.opacity_logits[i]).clamp(-60.0, 60.0)));
         let area = ((middle * scale[i]).powi(2) + BLUR).sqrt() * ((largest * scale[i]).powi(2) + BLUR).sqrt();
-        // A Gaussian that fills the image is not seen beyond it.
+        // At most the pixels of the image count.
         SH0 * SEEN * alpha * (std::f64::consts::PI * area).min(samples).sqrt()
     };
     let weights: Vec<f64> = (0..gaussians.len()).into_par_iter().map(weight).collect();

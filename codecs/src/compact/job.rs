@@ -1,4 +1,4 @@
-//! Gaussians in the steps of a quality: rounded, restored and coded, as often as the search for the quality asks for it.
+//! Rounds, restores and codes Gaussians for a quality, as often as the search for the quality needs it.
 
 use super::LOSSES;
 use super::columns::Columns;
@@ -23,14 +23,14 @@ pub struct Job<'a> {
     /// Of the Gaussians to encode.
     pub planner: Planner<'a>,
     pub free: Vec<bool>,
-    /// From where Gaussians are seen, where colours are rounded together.
+    /// The directions from which Gaussians are seen, if colours are rounded together.
     pub directions: Option<&'a Directions>,
     /// The layer of each Gaussian, and how many each layer has.
     pub layers: (Vec<u8>, Vec<usize>),
     pub motion: Motion,
     /// Of the columns, to start with.
     pub factors: Factors,
-    /// Whether colours are rounded together: not any more once that has exceeded the declared loss, so that attempts can be compared.
+    /// Whether colours are rounded together. False for all later attempts once this has exceeded the declared loss, so that attempts can be compared.
     pub joint: Cell<bool>,
 }
 
@@ -46,7 +46,7 @@ pub struct Attempt {
     pub quality: f64,
     /// Of the columns.
     factors: Factors,
-    /// Whether colours might be rounded together when it began.
+    /// Value of [`Job::joint`] when the attempt began.
     joint: bool,
     pub plan: Plan,
 }
@@ -73,10 +73,10 @@ impl Job<'_> {
     fn attempt_with<T>(&self, planner: &Planner, quality: f64, factors: &Factors, work: impl FnOnce(Integers) -> Result<T>) -> Result<(Attempt, T)> {
         let joint = self.joint.get();
         let (mut bounds, mut before, mut lost) = (Bounds { joint, ..Bounds::NONE }, None::<(Plan, Parts)>, Vec::<f64>::new());
-        // Colours may be rounded apart, and each column be stored exactly in the end.
+        // Besides the reductions: colours may change to independent rounding, and each column may end up stored exactly.
         for reductions in 0..REDUCTIONS + 2 + factors.len() {
             let plan = planner.plan(quality, factors, &bounds);
-            // Columns that keep their codes lose what they lost.
+            // Columns that keep their codes keep their losses.
             let keeps = before.as_ref().map(|(before, _)| (plan.keeps_shapes(before), plan.keeps_colors(before, self.directions)));
             let (shapes, colors) = keeps.unwrap_or_default();
             let known = |column: usize| match column {
@@ -111,7 +111,7 @@ impl Job<'_> {
         }
         Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
     }
-    /// Whether `attempt`, of the Gaussians to encode, is what would come of another with this quality and these factors.
+    /// Whether another attempt with this quality and these factors would give the same as `attempt`, which is one of the Gaussians to encode.
     pub fn repeats(&self, attempt: &Attempt, quality: f64, factors: &Factors) -> bool {
         attempt.quality == quality && attempt.factors == *factors && attempt.joint == self.joint.get()
     }

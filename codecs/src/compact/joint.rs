@@ -53,7 +53,7 @@ fn basis([x, y, z]: [f64; 3]) -> [f64; MOST] {
     ]
 }
 
-/// How errors of the coefficients of each Gaussian make up for each other.
+/// How errors of the coefficients of each Gaussian compensate for each other.
 pub struct Directions {
     /// Basis functions: (degree + 1)².
     functions: usize,
@@ -88,11 +88,11 @@ impl Directions {
             }
         });
     }
-    /// Ready to round, once all views were added.
+    /// Factors M of every Gaussian. Call it once all views were added.
     pub fn factored(mut self) -> Self {
         let functions = self.functions;
         self.triangles.par_chunks_exact_mut(start(functions)).for_each(|triangle| {
-            // Gaussians that no view sees round their coefficients by themselves.
+            // Coefficients of Gaussians that no view sees are rounded independently.
             if !factor(triangle, functions) {
                 triangle.fill(0.0);
             }
@@ -121,7 +121,7 @@ impl Directions {
         let of_degree = |degree: usize| missing.iter().flat_map(|chunk| &chunk[degree]).copied().collect();
         values.into_iter().enumerate().map(|(degree, values)| Codes { values, missing: of_degree(degree) }).collect()
     }
-    /// The same of some `rows` of all.
+    /// [`Directions::quantise`] for some `rows`.
     fn quantise_rows(&self, degrees: &[Degree], gaussians: Columns, classes: &[u8], rounds: &[bool], choices: &[Choices], rows: Range<usize>) -> Vec<Codes> {
         let (triangles, classes) = (&self.triangles[rows.start * start(self.functions)..rows.end * start(self.functions)], &classes[rows.clone()]);
         // Errors so far, by row, channel and function.
@@ -171,7 +171,7 @@ fn compensation(lower: &[f32], functions: usize, of: Range<usize>, errors: &[f64
     shifts
 }
 
-/// Puts L in the place of the triangle of M, to which [`UNSEEN`] is added; whether there is one.
+/// Replaces the triangle of M, to which [`UNSEEN`] is added, by that of L. Returns false where M has no such factor.
 fn factor(triangle: &mut [f32], functions: usize) -> bool {
     let mean = (0..functions).map(|k| f64::from(triangle[start(k) + k])).sum::<f64>() / functions as f64;
     if !(mean > 0.0 && mean.is_finite()) {
@@ -181,7 +181,7 @@ fn factor(triangle: &mut [f32], functions: usize) -> bool {
     let mut diagonal = [0.0; MOST];
     for i in 0..functions {
         for j in 0..=i {
-            // In units of the mean, so that no size of weights is out of range.
+            // Relative to the mean, so that weights of any size are in range.
             let mut sum = f64::from(triangle[start(i) + j]) / mean + if i == j { UNSEEN } else { 0.0 };
             for (m, d) in diagonal.iter().enumerate().take(j) {
                 sum -= rows[i][m] * rows[j][m] * d;
@@ -278,10 +278,10 @@ mod tests {
         let apart: Vec<Codes> = degrees.iter().enumerate().map(|(d, plan)| plan.quantise(columns.coefficients(d), &[0], &choices[d])).collect();
         let together = directions.quantise(&degrees, columns, &[0], &[true; 3], &choices);
         assert!(error(&together) < 0.1 * error(&apart), "{} and {}", error(&together), error(&apart));
-        // What is stored exactly leaves nothing to make up for.
+        // Degrees that are stored exactly have no errors to compensate for.
         assert!(directions.quantise(&degrees, columns, &[0], &[true, true, false], &choices)[..2] != together[..2]);
         assert_eq!(directions.quantise(&degrees, columns, &[0], &[false, false, false], &choices), apart);
-        // Without a view, coefficients are rounded apart.
+        // Without a view, coefficients are rounded independently.
         assert_eq!(Directions::new(1, 2).factored().quantise(&degrees, columns, &[0], &[true; 3], &choices), apart);
     }
 }

@@ -1,4 +1,4 @@
-//! `compact`: quantised by what is seen, transformed, predicted, and entropy coded.
+//! `compact`: quantised by the effect on images, transformed, predicted, and entropy coded.
 //!
 //! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
 //! the class before. Weights come from derivatives of renders in views, or from sizes and opacities. Streams, in the order in which a player
@@ -59,7 +59,7 @@ const LOSSES: [(&str, f64); 7] = [
     // One of two levels, each the mean of its scores.
     ("dynamic_scores", 1.0),
 ];
-/// Times at which the deformer is asked what it changes.
+/// Times at which [`keeps_shapes`] evaluates the deformer.
 const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
 
 struct Compact {
@@ -141,7 +141,7 @@ impl AttributeCodec for Compact {
         crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let streams = self.streams(gaussians, context)?;
-        // What cannot be read again is no file.
+        // Streams that cannot be decoded are an error.
         self.decode(&streams, &CodecContext::new(context.seed, context.limits, context.events))?;
         Ok(streams)
     }
@@ -215,7 +215,7 @@ mod tests {
     fn the_declared_loss_is_kept_by_the_steps_of_what_is_hardly_seen() {
         let n = 400;
         let mut g = random_gaussians(n, 2);
-        // Large beside the distances between them, so that steps of a size lose much.
+        // Large compared with the distances between them, so that steps relative to the size lose much.
         g.log_scales.fill(0.5);
         let context = CodecContext::new(cc4dgs_format::Seed::root(1), Default::default(), &cc4dgs_format::Silent);
         let mut importance = importance::estimate(&g, &context);
@@ -242,10 +242,10 @@ mod tests {
             losses.collect::<Vec<bool>>()
         };
         let lost = too_much(&wanted);
-        assert!(lost[0] && (lost[4] || lost[5]), "the test has nothing to show: {lost:?}");
+        assert!(lost[0] && (lost[4] || lost[5]), "no declared loss is exceeded without bounds: {lost:?}");
         let kept = job.attempt(0.05).unwrap().0.plan;
         assert_eq!(too_much(&kept), [false; 7]);
-        // Steps of class 0 are as wanted: the others pay.
+        // Steps of class 0 are those that were asked for; only those of coarser classes are smaller.
         assert_eq!((kept.geometry.cell, kept.geometry.scale_step), (wanted.geometry.cell, wanted.geometry.scale_step));
         assert!(kept.geometry.class_limit < wanted.geometry.class_limit);
         assert!((0..3).all(|d| kept.degrees[d].step_of(0) == wanted.degrees[d].step_of(0)));

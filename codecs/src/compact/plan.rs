@@ -34,7 +34,7 @@ pub struct Plan {
 /// Factors of the steps of the columns means, log-scales, quaternions, opacity logits, degree 0 and higher degrees.
 pub type Factors = [f64; 6];
 
-/// What is changed so that the declared loss is kept.
+/// Changes to a plan that keep the declared loss.
 #[derive(Clone, Copy)]
 pub struct Bounds {
     /// Factors of the largest step of each column; of all steps of those that have none. A column whose factor is 0 is stored exactly.
@@ -61,7 +61,7 @@ pub struct Planner<'a> {
     axes: [Vec<f32>; 3],
     /// Of each degree.
     transforms: Vec<Transform>,
-    /// What is known of the losses of the columns before any is rounded.
+    /// The part of the columns' losses that does not depend on rounding.
     pub losses: Losses,
 }
 
@@ -146,7 +146,7 @@ fn grid(geometry: &mut Geometry, axes: &[Vec<f32>; 3], middle: f64, pixels_per_u
         }
         best = growth * cost;
         geometry.cell = growth * cell;
-        // The grid is centred on the middle ones, and often holds some of those that may lie outside.
+        // The grid is centred on the centres that are not cut off, and often holds some of those that are.
         geometry.corner = spans.map(|[low, high]| if cut > 0.0 { 0.5 * (low + high) - 0.5 * cells * geometry.cell } else { low });
         let octaves = libm::log2(growth);
         geometry.size_floor = ((floor / std::f64::consts::LN_2 + octaves) * 65536.0) as i64;
@@ -154,7 +154,7 @@ fn grid(geometry: &mut Geometry, axes: &[Vec<f32>; 3], middle: f64, pixels_per_u
     }
 }
 
-/// What is left of sorted values without the share `cut` at either end.
+/// Least and largest of sorted values without the share `cut` at either end.
 fn span(sorted: &[f32], cut: f64) -> [f64; 2] {
     let last = sorted.len().saturating_sub(1);
     let skip = (cut * sorted.len() as f64).ceil() as usize;

@@ -53,7 +53,7 @@ pub struct Linear {
     weights: Vec<i16>,
 }
 
-/// What a lane knows.
+/// The state of a lane.
 struct State {
     history: History,
     /// Components of the row that is being coded.
@@ -137,8 +137,8 @@ impl Linear {
     pub const fn contexts(dims: usize) -> usize {
         dims * LEVELS
     }
-    /// Fits the weights to the rows `codes` `[N,dims]`, where so much is `known` about each. Blocks start where they would in one layer; that layers and lanes
-    /// start anew matters little.
+    /// Fits the weights to the rows `codes` `[N,dims]`; `known` gives what is known about each. Blocks start where they would in one layer; that
+    /// layers and lanes start anew is ignored, because it matters little.
     pub fn fit(dims: usize, codes: &[i32], known: impl Fn(usize) -> Known + Sync) -> Self {
         // Components are fitted in parallel: the codes of all of them are known.
         let component = |c: usize| match (dims, c) {
@@ -187,7 +187,7 @@ impl Linear {
         let lanes = Lanes::of(codes.len().min(known.len()));
         let weights: [[i64; INPUTS]; D] = std::array::from_fn(|c| std::array::from_fn(|k| i64::from(self.weights[c * INPUTS + k])));
         let mut states: [State; LANES] = std::array::from_fn(|_| State::new());
-        // What each pair of classes adds, with the constant.
+        // The contribution of each pair of classes, and of the constant.
         let of_classes = |weights: &[i64; INPUTS], k: usize| {
             let known = Known { classes: [(k / 16) as u8, (k % 16) as u8], ..Default::default() };
             weights[2 + DIMS..].iter().zip(known.octaves()).map(|(w, x)| w * x).sum::<i64>() + weights[INPUTS - 1] * CONSTANT

@@ -17,7 +17,7 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::slice;
 
-/// Gaussians per byte of all streams that a decoder believes: a block of 2^14 takes eight bytes or more in each of eight streams.
+/// Upper bound on Gaussians per byte of all streams: a block of 2^14 takes eight bytes or more in each of eight streams.
 const PER_BYTE: u64 = 512;
 
 /// What all columns depend on.
@@ -65,7 +65,7 @@ pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<H
     rows.scales = rows.read_scales(&coded(SCALES, Linear::contexts(3))?, &scale_plan)?;
     let rows = &rows;
 
-    // The others depend on classes and scales alone.
+    // The other columns depend on classes and scales alone.
     let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
     out.dynamic_scores =
         if scored == 1 { rows.moving.iter().map(|&m| levels[usize::from(m)]).collect() } else { read_scores(set.reader(SCORES)?, shape.count, n)? };

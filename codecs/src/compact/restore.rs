@@ -1,4 +1,4 @@
-//! What integers stand for: columns as they will be decoded, and what these lose. Rows that are stored exactly are those given.
+//! Columns as they will be decoded from integers, and their losses. Rows that are stored exactly are those of the given columns.
 
 use super::blocks::ROWS;
 use super::columns::{Columns, sorted};
@@ -7,10 +7,10 @@ use cc4dgs_format::storage::{ColumnLoss, PartialLoss};
 use cc4dgs_format::{ExtraAttribute, HostGaussians};
 use rayon::prelude::*;
 
-/// Which row of the columns given is at each index of the result: the same, or the one that is listed.
+/// The row of the given columns at each index of the result; `None`: the same index.
 type Order<'a> = Option<&'a [usize]>;
 
-/// What the integers of `given` stand for, with the rows in this `order` `[N]`, or in that of `given`.
+/// The Gaussians that the integers of `given` decode to, with the rows in this `order` `[N]`, or in that of `given`.
 pub fn restored(of: &Integers, given: Columns, order: Option<&[usize]>) -> HostGaussians {
     let mut sh_rest = vec![0.0; given.sh_rest.len()];
     of.rest(given.sh_rest, |index| order.map_or(index, |order| order[index]), &mut sh_rest);
@@ -32,8 +32,8 @@ pub fn restored(of: &Integers, given: Columns, order: Option<&[usize]>) -> HostG
     }
 }
 
-/// What means, log-scales, quaternions, opacity logits, degree 0 and higher degrees lose ([`column_loss`](cc4dgs_format::storage::column_loss)). Each thread
-/// has one of them in memory, and of the higher degrees a block of rows. Those that are `known` are taken.
+/// Losses of means, log-scales, quaternions, opacity logits, degree 0 and higher degrees ([`column_loss`](cc4dgs_format::storage::column_loss)). Each thread
+/// has one of these columns in memory, and of the higher degrees a block of rows. Losses that are `known` are not computed again.
 pub fn losses(of: &Integers, given: Columns, before: &Losses, known: [Option<f64>; 6]) -> Vec<f64> {
     let loss = |column: usize| {
         if let Some(loss) = known[column] {
@@ -52,7 +52,7 @@ pub fn losses(of: &Integers, given: Columns, before: &Losses, known: [Option<f64
     (0..6).into_par_iter().map(loss).collect()
 }
 
-/// What is known of the [`losses`] of columns before any is decoded.
+/// The part of the [`losses`] of columns that does not depend on decoded values.
 pub struct Losses {
     /// Means, log-scales, quaternions, opacity logits, degree 0.
     columns: [ColumnLoss; 5],

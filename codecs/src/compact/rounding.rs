@@ -1,4 +1,4 @@
-//! Gaussians as they will be decoded, and what their values cost, without coding them. Fine-tuning asks for both in every iteration.
+//! Gaussians as they will be decoded, and estimates of their bits, without coding them. Fine-tuning needs both in every iteration.
 
 use super::colors::slope;
 use super::columns::Columns;

@@ -71,7 +71,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     let tuner = tuner.filter(|_| caution.is_none());
     let directions = job.directions;
     if tuner.is_some() {
-        // Training learns which coefficients matter, and starts from steps of coefficients by themselves.
+        // Training learns which coefficients matter, and starts from independently rounded coefficients.
         job.directions = None;
     }
     let corrected = services.filter(|_| settings.allocate);
@@ -79,7 +79,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     let mut streams = found.coded(job)?;
     if let Some(((views, renderer), whole)) = corrected {
         let plain = job.factors;
-        // Where a size is allowed, more is lost before fine-tuning than after it.
+        // For a bounded size, the loss before fine-tuning is larger than after it.
         let fewer = tuner.is_some() && allowance.is_of_bytes();
         let judges = context.judging_views().unwrap_or(views);
         let quality = found.attempt.quality * if fewer { fine(job, &found.attempt, whole, judges, renderer)? } else { 1.0 };
@@ -88,11 +88,11 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
         let mut second = seek(job, found.attempt.quality, None, &allowance, GOOD)?;
         let coded = second.coded(job)?;
-        // The corrections may be worth nothing in small models.
+        // In small models the corrections may save nothing.
         let saves = allowance.is_of_bytes() || bytes_of(&coded) < bytes_of(&streams);
         if plain_is_better(found.share, second.share, saves) {
             job.factors = plain;
-            // It was good enough to be corrected.
+            // The first search ended at `ROUGH`; without corrections it goes on to `GOOD`.
             if found.share < GOOD {
                 let start = found.attempt.quality;
                 let first = Some(Tried { streams: Some(streams), ..found }).filter(|found| job.repeats(&found.attempt, start, &plain));
@@ -114,11 +114,11 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             Tuned::Better(streams) => return Ok(streams),
             Tuned::Nearest { streams: tuned, used } => (found.share, streams) = (used / goal.limit(), tuned),
             Tuned::Nothing { lost } => {
-                // It was measured on more views, and with the deformer's weights as they are stored.
+                // The loss without training, measured on more views and with the deformer's weights as they are stored.
                 if let Goal::Drop(limit) = goal {
                     found.share = found.share.max(lost / limit);
                 }
-                // Training was what colours were rounded apart for.
+                // Colours were rounded independently for training only.
                 if directions.is_some() {
                     job.directions = directions;
                     let mut joint = seek(job, found.attempt.quality, None, &allowance, GOOD)?;
@@ -128,7 +128,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
                         joint.share = joint.share.max(tune::loss(tuner, gaussians, &rounded)? / limit);
                     }
                     let better = match (joint.allowed(), found.allowed()) {
-                        // In the same bytes, colours that are rounded together are nearer.
+                        // In the same number of bytes, joint rounding has smaller errors.
                         (true, true) => matches!(goal, Goal::Bytes(_)) || bytes_of(&coded) < bytes_of(&streams),
                         (false, false) => joint.share < found.share,
                         (fits, _) => fits,
@@ -144,8 +144,8 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     Ok(streams)
 }
 
-/// Whether the best attempt without corrections of the columns is better than that with them. Given are the shares of what is allowed that they use, and
-/// whether the corrections save bytes where these are not what is allowed. Of two that use too much, the better is nearer to what is allowed.
+/// Whether the best attempt without corrections of the columns is better than the best one with them. `plain` and `corrected` are the shares of the allowance
+/// that they use. `saves` says whether the corrections save bytes; it is true where bytes are bounded. If both use too much, the smaller share is better.
 fn plain_is_better(plain: f64, corrected: f64, saves: bool) -> bool {
     match (plain <= 1.0, corrected <= 1.0) {
         (true, fits) => !(fits && saves),

@@ -5,7 +5,7 @@ use super::job::{Attempt, Job};
 use super::search::file_bytes;
 use cc4dgs_format::{CodecContext, Error, Result, Stream};
 
-/// Attempts of a search, at most; and as many more where it has found no file that is small enough, which is where an octave of the steps saves fewer bytes
+/// Upper bound on the attempts of a search; as many more follow if no file was small enough, which happens where an octave of the steps saves fewer bytes
 /// than expected.
 const ATTEMPTS: usize = 8;
 /// Parameters of a Gaussian that are not rounded to zero, for the estimate of the error.

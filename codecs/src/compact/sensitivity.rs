@@ -10,7 +10,7 @@ use std::ops::RangeInclusive;
 /// Views on which errors are measured, by [`budget`].
 const VIEWS: RangeInclusive<usize> = 4..=8;
 const WORK: usize = 500_000;
-/// The change that is tried first, in standard deviations of the values.
+/// The first change of the values, in their standard deviations.
 const CHANGE: f64 = 0.02;
 /// Largest step, in standard deviations.
 pub const LARGEST: f64 = 0.5;

@@ -186,7 +186,7 @@ mod tests {
             let settings = parse(profile, table).unwrap();
             settings.check_without_tuner().and_then(|()| settings.check_without_views()).map_err(|e| e.to_string())
         };
-        // What is 0 asks for nothing.
+        // A value of 0 asks for nothing.
         for (profile, table) in [("", ""), ("", "max_drop_db = 0.0\nfinetune = 0"), ("psnr=50dB", ""), ("max-size=5MB", "finetune = 0")] {
             assert_eq!(without_scene(profile, table), Ok(()), "{profile} {table}");
         }

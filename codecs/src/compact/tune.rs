@@ -1,6 +1,6 @@
 //! Fine-tuning: rounds of training with rounded values, each in the steps that those before suggest.
 //!
-//! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The
+//! Training compensates for rounding errors, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The
 //! best file that keeps what is allowed is taken; if there is none, the one that needed no training.
 
 use super::bytes_of;
@@ -41,17 +41,17 @@ pub enum Goal {
     Bytes(f64),
 }
 
-/// What training came to.
+/// The result of fine-tuning.
 pub enum Tuned {
     /// Streams that are better than those without training.
     Better(Vec<Stream>),
-    /// Streams of which none keep what is allowed, nor do those without training, and that come nearest: they use so much of what is bounded.
+    /// No streams keep what is allowed, with or without training. These use least of what is bounded.
     Nearest { streams: Vec<Stream>, used: f64 },
     /// Nothing better: those without training lose `lost` dB of PSNR.
     Nothing { lost: f64 },
 }
 
-/// What needed no training.
+/// The result without training.
 pub struct Untuned<'a> {
     pub attempt: &'a Attempt,
     pub streams: &'a [Stream],
@@ -59,7 +59,7 @@ pub struct Untuned<'a> {
     pub allowed: bool,
 }
 
-/// What a round came to.
+/// The result of a round.
 struct Outcome {
     streams: Vec<Stream>,
     model: TunedModel,
@@ -87,7 +87,7 @@ impl Goal {
     }
 }
 
-/// The best streams that `goal` allows, after training; `found` is what there is without. A round that fails is the last: what those before came to is kept.
+/// The best streams that `goal` allows, after training; `found` is the result without. A round that fails is the last; the results of earlier rounds are kept.
 pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner: &dyn TuneModel, context: &CodecContext) -> Result<Tuned> {
     let megabytes = |bytes: usize| bytes as f64 / 1e6;
     let gaussians = job.planner.gaussians;
@@ -127,7 +127,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
             ((file - SIZE_AIM * limit) / (per_octave + saved_weights(tuner, &model.weights, steps, weights)?)).clamp(-FIRST, FIRST)
         }
     };
-    // What a round comes to, and the bytes that an octave of its steps saves.
+    // The result of a round, and the bytes that an octave of its steps saves.
     let train = |model: &TunedModel, round: usize, octaves: f64| -> Result<(Outcome, f64)> {
         let quality = found.attempt.quality * libm::exp2(octaves);
         let weight_steps = libm::exp2(octaves + of_weights);
@@ -136,7 +136,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         let per_octave = saved_by_doubling(job, &planner, quality, bytes_of(&untrained))?;
         let bits_per_octave = 8.0 * per_octave;
         let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
-        // Those that follow are as long as the last.
+        // Rounds beyond the planned ones are as long as the last planned one.
         let share = |round: usize| shares[round.min(count - 1)];
         let (iterations, done) = (share(round), (0..round).map(share).sum::<usize>());
         let of = (done, settings.finetune.max(done + iterations));
@@ -159,7 +159,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
             Goal::Drop(_) => (drop, 0.0),
             Goal::Bytes(_) => {
                 let file = file_bytes(context, &streams, Some((&model.weights, weight_steps)))?;
-                // Only steps of another round need it.
+                // Only another round needs the saved bytes.
                 let goes_on = number < count || (file > goal.limit() && number < count + FURTHER);
                 (file, if goes_on { saved_weights(tuner, &model.weights, weight_steps, weights)? } else { 0.0 })
             }

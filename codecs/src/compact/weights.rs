@@ -129,7 +129,7 @@ fn code<C: Coder>(coder: &mut C, (index, arrays): (usize, usize), form: Form, sh
     Ok(())
 }
 
-/// Codes nothing: what it is given comes back at once.
+/// A coder that codes nothing: it returns every value that it is given.
 struct Uncoded;
 
 impl Coder for Uncoded {
@@ -203,7 +203,7 @@ impl WeightCodec for Weights {
         Ok(arrays)
     }
     fn round(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Vec<WeightArray>> {
-        // Refuses what `encode` refuses.
+        // For the errors of `encode`.
         write_shapes(weights, &mut Vec::new())?;
         let mut rounded = weights.to_vec();
         for (index, (array, found)) in weights.iter().zip(&mut rounded).enumerate() {
@@ -228,7 +228,7 @@ impl WeightCodec for Weights {
         Ok(Some(out))
     }
     fn loss(&self) -> f64 {
-        // Arrays beyond the list have `bits`, which stands behind it.
+        // Arrays beyond the list have `bits`: the index behind the last one stands for them.
         let least = (0..=self.array_bits.len()).map(|index| self.quarter_bits(index)).min().unwrap_or(0);
         0.5 / Form { quarter_bits: least, largest: 1.0, shifted: false }.peak() + 1e-6
     }
@@ -304,7 +304,7 @@ mod tests {
         let found = codec.decode(&codec.encode(&weights, &context).unwrap(), &plain).unwrap();
         let worst = |kind: usize| (0..count).filter(|k| k / ROW % 4 == kind).map(|k| (found[0].values[k] - weights[0].values[k]).abs()).fold(0.0f32, f32::max);
         assert!(worst(0) < 0.001 && worst(2) > 4.0 * worst(0) && worst(3) > 4.0 * worst(2) && worst(1) > 0.9, "{:?}", [0, 1, 2, 3].map(worst));
-        // Importance that says nothing changes nothing.
+        // Importance that is constant, not finite or of another length changes nothing.
         for odd in [vec![1.0; count], vec![0.0; count], vec![f32::NAN; count], vec![f32::INFINITY; count], vec![1.0; 3]] {
             let importance = [odd];
             let context = CodecContext { weight_importance: Some(&importance), ..CodecContext::new(Seed::root(1), Limits::default(), &Silent) };

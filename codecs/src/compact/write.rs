@@ -47,13 +47,13 @@ impl Motion {
     }
 }
 
-/// What predicts scales and colours of a row.
+/// The inputs of the prediction of scales and colours of a row.
 pub fn known_classes(color: u8, shape: u8, for_color: bool, limit: u8) -> Known {
     let class = if for_color { color } else { shape };
     Known { classes: [color, shape], class, shift: class.min(limit), ..Default::default() }
 }
 
-/// What predicts the opacity of a row: its classes and its scales, in the steps of class 0.
+/// The inputs of the prediction of the opacity of a row: its classes and its scales, in the steps of class 0.
 pub fn known_scales(color: u8, shape: u8, scales: &[i32; 3], scale_limit: u8, limit: u8) -> Known {
     let mut out = known_classes(color, shape, false, limit);
     for (given, &code) in out.given.iter_mut().zip(scales) {

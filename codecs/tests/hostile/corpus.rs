@@ -1,4 +1,4 @@
-//! Damages that were worth keeping, in `tests/corpus`: one for every outcome that a decoder was seen to have. A file holds sound streams, as an encoder of its
+//! Damages that are kept in `tests/corpus`: one for every outcome that a decoder was seen to have. A file holds sound streams, as an encoder of its
 //! time wrote them, and a line per case. They are repeated by every run, and new damages are done on top of them.
 
 use super::damage::{Damage, harm};
@@ -49,7 +49,7 @@ fn size(streams: &[Stream]) -> usize {
     streams.iter().map(|s| s.bytes.len()).sum()
 }
 
-/// Whether the corpus is to be written.
+/// Whether the corpus is to be extended.
 fn grows() -> bool {
     std::env::var_os("CC4DGS_HOSTILE_CORPUS").is_some()
 }

@@ -87,7 +87,7 @@ fn seconds(of: usize) -> Duration {
     Duration::from_secs_f64(wanted)
 }
 
-/// What came of decoding: a word for what happened, or what is wrong with the result.
+/// The outcome of decoding: its name, or what is wrong with the result.
 type Outcome = std::result::Result<String, String>;
 
 fn happened<T>(found: &Result<T>, sound: &[Stream]) -> String {
@@ -121,7 +121,7 @@ fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream
         if began.elapsed() >= time {
             break;
         }
-        // A runner that has seen enough cases runs no more, so each round has its own.
+        // A runner stops after its number of cases, so each round has its own.
         let mut seed = [0; 32];
         seed[..8].copy_from_slice(&Seed::root(round).value().to_le_bytes());
         let rng = proptest::test_runner::TestRng::from_seed(proptest::test_runner::RngAlgorithm::ChaCha, &seed);

@@ -114,8 +114,8 @@ mod enumeration {
         ADAPTERS.get_or_init(settle)
     }
 
-    /// The adapters of one API, chosen as burn chooses: the first with a GPU, else the first with software. Another would list the same cards again, and burn
-    /// counts within one.
+    /// The adapters of one API, chosen as burn chooses: the first API with a GPU, else the first with software. Other APIs list the same cards again, and the
+    /// indices of burn's devices count within one API.
     fn settle() -> Vec<Adapter> {
         let apis: &[Backends] = if cfg!(target_os = "macos") { &[Backends::METAL] } else { &[Backends::VULKAN, Backends::DX12, Backends::GL] };
         let mut software = Vec::new();

@@ -48,8 +48,8 @@ impl DepthImage {
         let problem = format!("{}x{} pixels of depth for an image of {w}x{h}", self.width, self.height);
         Err(Error::data(object, problem, "Give depth the proportions of its image, and show the same in it; its size may be another"))
     }
-    /// An image of `width` x `height` pixels whose pixel with its centre at (u, v) has the value that is here at `source(u, v)`, in shares of this width and
-    /// height; it is unknown where that lies outside. Nothing is averaged: there is no surface between two others, and pixels of unknown depth say nothing.
+    /// An image of `width` x `height` pixels. The pixel with its centre at (u, v) has the value of this image at `source(u, v)`, in shares of this width and
+    /// height, and is unknown where that lies outside. Depths are not averaged: the mean of two surfaces is no surface, and pixels may be unknown.
     pub fn resampled(&self, width: u32, height: u32, source: impl Fn(f64, f64) -> (f64, f64) + Sync) -> Self {
         let (w, h) = (f64::from(self.width), f64::from(self.height));
         let value = |x: u32, y: u32| {

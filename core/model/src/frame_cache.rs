@@ -1,38 +1,38 @@
-//! Decoded frames and depth that are kept: those of a scene and of the scenes derived from it, within one bound.
+//! A cache of decoded frames and depth, which a scene and the scenes derived from it share within one bound in bytes.
 
 use crate::{DepthImage, FrameSource, Image8, Result};
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// The frames and the depth of a source, those of them that are kept among others in [`KeptFrames`].
+/// The frames and the depth of a source, cached in [`KeptFrames`] together with those of other sources.
 pub(crate) struct FrameCache {
     pub source: Arc<dyn FrameSource>,
-    /// Its number among those that share `kept`.
+    /// Index of this source among those that share `kept`.
     number: usize,
     pub kept: Arc<KeptFrames>,
 }
 
-/// What is kept of the frames of a scene and of those derived from it.
+/// The cached frames and depth of a scene and of those derived from it.
 pub(crate) struct KeptFrames {
     pub cap: u64,
     caches: AtomicUsize,
     pub state: Mutex<CacheState>,
 }
 
-/// One thing that is kept of a view.
+/// A cached value of a view.
 #[derive(Clone)]
 pub(crate) enum Kept {
     Image(Arc<Image8>),
     Depth(Arc<DepthImage>),
 }
 
-/// Number of the cache, view, and whether it is the depth.
+/// Index of the source, view, and whether it is the depth.
 type Key = (usize, usize, bool);
 
 #[derive(Default)]
 pub(crate) struct CacheState {
-    /// What is kept, and when it was last used.
+    /// Cached values, and the clock when each was last used.
     pub frames: HashMap<Key, (Kept, u64)>,
     pub bytes: u64,
     clock: u64,
@@ -66,7 +66,7 @@ impl FrameCache {
 }
 
 impl Drop for FrameCache {
-    /// Nobody can ask for its frames any more, and others may use their bytes.
+    /// Removes the values of this source, because nothing can read them any more; their bytes are free for other sources.
     fn drop(&mut self) {
         if let Ok(mut state) = self.kept.state.lock() {
             let CacheState { frames, bytes, .. } = &mut *state;
@@ -77,7 +77,7 @@ impl Drop for FrameCache {
 }
 
 impl KeptFrames {
-    /// Keeps `cap` bytes at most.
+    /// A cache of at most `cap` bytes.
     pub fn new(cap: u64) -> Self {
         Self { cap, caches: AtomicUsize::new(0), state: Mutex::default() }
     }
@@ -106,10 +106,10 @@ impl Kept {
 }
 
 impl CacheState {
-    /// Keeps `new` in place of what was not used for longest.
+    /// Adds `new`; removes the least recently used values until it fits.
     fn keep(&mut self, key: Key, new: Kept, cap: u64) {
         let size = new.bytes();
-        // What another thread has decoded, too, or what never fits, is no reason to drop others.
+        // Values that another thread has added already, and values over the bound, remove nothing.
         if size > cap || self.frames.contains_key(&key) {
             return;
         }

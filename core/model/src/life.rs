@@ -3,11 +3,11 @@
 /// Names of the attributes, in order, and their widths: the centre T of a life and the logarithms of its half-width r and of its falloff s, as shares of the
 /// sequence; its gate; and the velocity in world units per sequence.
 pub const LIFE_ATTRIBUTES: [(&str, usize); 5] = [("life_center", 1), ("life_log_half_width", 1), ("life_log_falloff", 1), ("life_gate", 1), ("velocity", 3)];
-/// How steep the gate is in its attribute (FreeTimeGS++).
+/// Slope of the gate: it is the sigmoid of this factor times its attribute (FreeTimeGS++).
 pub const LIFE_GATE_STEEPNESS: f32 = 20.0;
 
-/// The value of the attribute `life_gate` for a gate `gate` in 0..1. It is finite for 0, of which a gate of 2e-9 is left, and for 1, which is 1 again in float32:
-/// such a Gaussian lasts, and its life has no gradient.
+/// The value of the attribute `life_gate` for a gate `gate` in 0..1. It is finite for 0, which becomes a gate of 2e-9, and for 1, which is 1 again in
+/// float32: such a Gaussian is visible at all times, and its life has no gradient.
 pub fn gate_value(gate: f32) -> f32 {
     ((gate / (1.0 - gate)).ln() / LIFE_GATE_STEEPNESS).clamp(-1.0, 1.0)
 }

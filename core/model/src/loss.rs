@@ -36,8 +36,7 @@ pub struct LossInput<'a> {
 }
 
 impl<'a> LossInput<'a> {
-    /// What is seen of `gaussians` by `camera` in `view`; the fields say what the arguments are. The Gaussians stand still: `canonical` is `gaussians`.
-    /// There is no recorded depth.
+    /// The input for static Gaussians (`canonical` is `gaussians`) without recorded depth. The arguments are the fields of the same names.
     pub fn new(
         camera: &'a Camera,
         view: &'a View,

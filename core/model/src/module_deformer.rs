@@ -29,7 +29,7 @@ pub struct ModuleDeformer<M, S, D> {
     start: Option<Start<M>>,
     progress: Option<Progress<M>>,
     cached: bool,
-    /// Beginnings of paths that were asked for and that no weight has.
+    /// Prefixes given to `with_grid` and `with_group` that no weight's path has.
     unmatched: Vec<String>,
 }
 
@@ -106,7 +106,7 @@ where
             self.unmatched.push(prefix.into());
         }
     }
-    /// Refuses beginnings of paths that no weight has.
+    /// Refuses prefixes that no weight's path has.
     fn check_paths(&self) -> Result<()> {
         let Some(prefix) = self.unmatched.first() else { return Ok(()) };
         let paths: Vec<&str> = self.parameters.iter().map(|p| p.name.as_str()).collect();

@@ -93,7 +93,7 @@ pub struct RenderSettings {
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
     /// Capacity in (Gaussian, tile) pairs, for devices that would otherwise wait until the count of every image was read back. Pairs beyond it are not drawn, those
-    /// of the farthest Gaussians first, and gradients are of no use then; [`RenderStats::pair_count`] has the true count. Neither image nor gradients depend on
+    /// of the farthest Gaussians first, and gradients are wrong then; [`RenderStats::pair_count`] has the true count. Neither image nor gradients depend on
     /// a capacity that suffices. `None`, or more than the device's limit, draws all pairs.
     pub pair_capacity: Option<usize>,
 }

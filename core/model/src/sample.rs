@@ -1,9 +1,9 @@
-//! A few of many, evenly spread.
+//! Evenly spread samples of views and other lists.
 
 use crate::Scene;
 use std::collections::BTreeMap;
 
-/// Share of its frames by which the views of a camera are turned against those of the one before: multiples of the golden ratio are spread over 0..1.
+/// Share of its frames by which the views of a camera are rotated relative to those of the previous camera: multiples of the golden ratio spread over 0..1.
 const TURN: f64 = 0.618_033_988_749_895;
 
 /// At most `most` of `items`, from the middles of equal parts.
@@ -18,13 +18,13 @@ pub fn spread_from_first<T: Copy>(items: &[T], most: usize) -> Vec<T> {
     if n <= most { items.to_vec() } else { (0..most).map(|i| items[i * n / most]).collect() }
 }
 
-/// `views` of `scene` camera after camera, the frames of each turned against those of the one before. Scenes have their views by frame, where every so many are
-/// often of one camera; in this order they are of all cameras, and of many frames.
+/// `views` of `scene` camera after camera; the frames of each camera are rotated relative to those of the previous one. Scenes list their views by frame, where
+/// every n-th view may be of one camera; in this order every n-th views are of all cameras and of many frames.
 pub fn by_camera(scene: &Scene, views: &[usize]) -> Vec<usize> {
     by_group(views, |view| scene.views[view].camera)
 }
 
-/// `items` group after group, those of each turned against those of the one before.
+/// `items` group after group; those of each group are rotated relative to those of the previous one.
 pub fn by_group<T: Copy, K: Ord>(items: &[T], group: impl Fn(T) -> K) -> Vec<T> {
     let mut groups: BTreeMap<K, Vec<T>> = BTreeMap::new();
     items.iter().for_each(|&item| groups.entry(group(item)).or_default().push(item));

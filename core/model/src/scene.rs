@@ -61,7 +61,7 @@ pub trait FrameSource: Send + Sync {
     }
     /// The recorded depth of that image, where there is one. The source of a [`Scene`] returns it at the size of the camera, in units of the scene. That of a
     /// reader returns it as it was taken, through the lens, in units of the dataset and with the proportions of the image. It is asked for where a loss term
-    /// compares it, and by who wants to know whether there is one.
+    /// compares it, and to find out whether there is one.
     ///
     /// # Errors
     /// [`Error::Data`] for a depth that cannot be read.
@@ -159,8 +159,8 @@ impl Scene {
     pub fn split(&self, split: Split) -> Vec<usize> {
         (0..self.views.len()).filter(|&i| self.views[i].split == split).collect()
     }
-    /// The split whose images judge what a trained model loses where Gaussians are removed, values rounded or weights stored in fewer bits: validation views where
-    /// there are some, because no training has fitted them, else training views. Test views never judge: they score what comes of it.
+    /// The split on which losses of a trained model are measured where Gaussians are removed, values rounded or weights stored in fewer bits: validation views
+    /// if there are some, because no training has fitted them, else training views. Never test views: they score the result.
     pub fn judging_split(&self) -> Split {
         if self.views.iter().any(|view| view.split == Split::Validation) { Split::Validation } else { Split::Train }
     }
@@ -320,15 +320,15 @@ mod tests {
             derived.frame(view).unwrap();
             assert!(kept() <= 1000, "{} bytes after view {view}", kept());
         }
-        // Of one view both images are kept apart, and the last ones are there.
+        // Images of one view in two scenes have separate entries, and the last ones are cached.
         assert_eq!((scene.frame(5).unwrap().data.len(), derived.frame(5).unwrap().data.len()), (300, 90));
         assert_eq!((loads(&large), loads(&small)), (6, 6));
-        // What is larger than the bound drives nothing out.
+        // An image over the bound removes no other from the cache.
         let before = kept();
         let other = scene.derived(camera(), huge.clone()).unwrap();
         other.frame(0).unwrap();
         assert_eq!((kept(), loads(&huge)), (before, 1));
-        // The frames of a scene that is gone make room.
+        // The frames of a scene that was dropped are removed from the cache.
         let copy = derived.clone();
         drop(derived);
         assert_eq!(kept(), before, "a clone still has them");

@@ -68,11 +68,11 @@ pub struct Schedule {
     pub image_scale: f32,
     /// 1.1 times the largest distance of a training camera from their mean, world units.
     pub extent: f32,
-    /// Whether the model is trained already: what a deformer brings in gradually is all there, while rates are those of [`Schedule::progress`].
+    /// Whether the model is trained already: the deformer gets progress 1, while rates are those of [`Schedule::progress`].
     pub trained: bool,
 }
 
-/// Iterations of a trained model are so small a share of this that rates stay what they are, and far enough apart that no two draw the same random numbers.
+/// Half the length of the stage of [`Schedule::further`]: rates hardly change over its iterations, and each has its own index for random numbers.
 const HALF: usize = 1_000_000;
 
 impl Schedule {
@@ -80,11 +80,11 @@ impl Schedule {
     pub fn main(length: usize) -> Self {
         Self { stage: Stage::Main, iteration: 1, length, settled: None, total: length, pass: 1, sh_degree: 3, image_scale: 1.0, extent: 1.0, trained: false }
     }
-    /// Iteration `iteration`, from 0 to a million, of training a trained model further, as for fine-tuning: rates stand in the middle of a main stage.
+    /// Iteration `iteration`, from 0 to a million, of training a trained model further, as for fine-tuning: rates are those at half of a main stage.
     pub fn further(iteration: usize) -> Self {
         Self { iteration: HALF + iteration, trained: true, ..Self::main(2 * HALF) }
     }
-    /// The progress that the deformer is told, above 0 and at most 1.
+    /// The progress for [`Deformer::set_progress`](crate::Deformer::set_progress), above 0 and at most 1.
     pub fn deformer_progress(&self) -> f64 {
         if self.trained { 1.0 } else { self.progress() }
     }

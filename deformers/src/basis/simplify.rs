@@ -1,6 +1,6 @@
 //! Drops functions of time that a trained deformer hardly uses, and heads without effect: fewer bytes to store and fewer coefficients to read per frame.
 //!
-//! A function's part in a head's offsets is measured on all of the scene's own Gaussians and times, not on weights: the root-mean-square of its coefficients
+//! A function's part in a head's offsets is measured on the Gaussians and times of the scene, not on weights: the root-mean-square of its coefficients
 //! times its own. Functions are dropped from the smallest part on, as long as the root-mean-square of all that is dropped stays below a share of that of the
 //! head's offsets.
 
@@ -65,8 +65,8 @@ pub(super) fn simplified(field: &Basis, features: Tensor<2>, times: &[f32]) -> R
     Ok(Some(Simplified { settings: small.section.clone(), field: Box::new(small), message }))
 }
 
-/// How each pair of a head's `count` functions adds to the mean square of its offsets over Gaussians, outputs and times `[count, count]`: mean of c cᵀ times mean
-/// of φ φᵀ, entry by entry. The sum over all pairs is the whole mean square, that over the pairs of some functions the mean square of what these add.
+/// The contribution of each pair of a head's `count` functions to the mean square of its offsets over Gaussians, outputs and times `[count, count]`: mean of c
+/// cᵀ times mean of φ φᵀ, entry by entry. The sum over all pairs is the mean square; the sum over pairs of a subset is the mean square of its offsets.
 fn effects<'a>(coefficients: impl Iterator<Item = &'a [f32]>, functions: impl Iterator<Item = &'a [f32]>, count: usize) -> Vec<f64> {
     let (of_coefficients, of_functions) = (mean_products(coefficients, count), mean_products(functions, count));
     of_coefficients.iter().zip(&of_functions).map(|(c, f)| c * f).collect()
@@ -78,7 +78,7 @@ fn mean_products<'a>(rows: impl Iterator<Item = &'a [f32]>, count: usize) -> Vec
     for row in rows {
         wide.iter_mut().zip(row).for_each(|(wide, v)| *wide = f64::from(*v));
         for (i, (sums, a)) in sums.chunks_exact_mut(count).zip(&wide).enumerate() {
-            // The other half of the products is the same.
+            // The matrix is symmetric.
             sums[i..].iter_mut().zip(&wide[i..]).for_each(|(sum, b)| *sum += a * b);
         }
         seen += 1;
@@ -87,7 +87,7 @@ fn mean_products<'a>(rows: impl Iterator<Item = &'a [f32]>, count: usize) -> Vec
     (0..count * count).map(|k| mean((k / count, k % count))).collect()
 }
 
-/// The functions to keep of `count`, so that what the others add has a mean square of at most `allowed`.
+/// The functions to keep of `count`, so that the offsets of the others have a mean square of at most `allowed`.
 fn keep(effects: &[f64], count: usize, allowed: f64) -> Vec<usize> {
     let part = |f: usize| effects[f * count + f];
     let mut order: Vec<usize> = (0..count).collect();
@@ -96,7 +96,7 @@ fn keep(effects: &[f64], count: usize, allowed: f64) -> Vec<usize> {
     let mut square = 0.0;
     for f in order {
         square += part(f) + 2.0 * left_out.iter().map(|&g| effects[f * count + g]).sum::<f64>();
-        // Not a number is no reason to drop anything.
+        // False for NaN: nothing is dropped.
         if square <= allowed {
             left_out.push(f);
         } else {

@@ -1,4 +1,4 @@
-//! The field evaluated without burn is the same field.
+//! Compares the evaluation of the field without burn with the deformer.
 
 use super::*;
 use burn::tensor::TensorData;
@@ -9,7 +9,7 @@ use cc4dgs_core::{DeformerPlugin, Entries, HostGaussians, Seed, WeightArray};
 const COUNT: usize = 37;
 const LEAST_SAMPLES: usize = 9;
 
-/// The evaluation without burn of the version that is trained.
+/// The motion plug-in for the version of the deformer that training stores.
 fn plugin(kind: SpaceKind) -> &'static MotionPlugin {
     let plugin = Entries::<MotionPlugin>::collect().unwrap().get(kind.name()).unwrap();
     let trained = Entries::<DeformerPlugin>::collect().unwrap().get(kind.name()).unwrap();

@@ -1,4 +1,4 @@
-//! Lives of Gaussians, for what appears, vanishes or crosses a scene faster than smooth functions follow: settings, attributes, and the formula of
+//! Lives of Gaussians, for content that appears, vanishes or crosses a scene faster than smooth functions follow: settings, attributes, and the formula of
 //! [`cc4dgs_backends::ops::life`].
 
 use crate::parts::centres::check_time;
@@ -18,7 +18,7 @@ pub struct LifeSettings {
     pub half_width: f32,
     /// Start of s, as a share of the sequence.
     pub falloff: f32,
-    /// Start of the gate, 0..1: nearly 1 is nearly as without time.
+    /// Start of the gate, 0..1; near 1 a Gaussian is visible at all times.
     pub gate: f32,
     /// Centres of life start up to this far from the middle of the sequence, as a share of it.
     pub spread: f32,
@@ -40,7 +40,7 @@ pub struct LifeSettings {
 }
 
 impl Default for LifeSettings {
-    /// Beside another deformer: all Gaussians last, and only those that are added with a life of their own have one.
+    /// Defaults of the layer `life`: Gaussians are visible at all times, unless they are added with a life of their own.
     fn default() -> Self {
         Self {
             half_width: 0.05,

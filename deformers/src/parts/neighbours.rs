@@ -28,7 +28,7 @@ pub struct Pair {
 
 /// Up to 2,048 pairs of a random point and, at random, one of its `count` nearest others.
 ///
-/// With at most 256 points every one is the first of a pair, and neighbours are exact. More points are cut across their longest side, at random places near
+/// With at most 256 points every one is the first of a pair, and neighbours are exact. More points are cut across their longest side, at random ranks near
 /// the median, until patches of at most 256 remain: neighbours beyond a cut are missed, and each draw cuts elsewhere. Of more than 16,384 points, a draw takes
 /// its pairs from one random region of at most as many. All points are about equally likely to be the first of a pair. Time and memory are linear in the number
 /// of points for any distribution, duplicates included. A point that is not finite has no neighbours and is no neighbour.
@@ -53,7 +53,7 @@ fn divide(points: &[[f32; 3]], rows: &mut [u32], wanted: usize, count: usize, ra
     rows.select_nth_unstable_by(cut, |&a, &b| points[a as usize][axis].total_cmp(&points[b as usize][axis]).then(a.cmp(&b)));
     let (low, high) = rows.split_at_mut(cut);
     let of_low = if total > REGION || wanted <= PATCH {
-        // All of one side, the likelier the more points it has.
+        // All pairs from one side, chosen with a probability in proportion to its points.
         if random.random_range(0..total) < cut { wanted } else { 0 }
     } else {
         wanted * cut / total

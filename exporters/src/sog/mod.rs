@@ -27,7 +27,7 @@ const HIGHEST_DEGREE: usize = 3;
 const LARGEST_SIDE: usize = 16_380;
 /// Largest code of a coordinate: 16 bits.
 const LARGEST_CODE: f64 = 65_535.0;
-/// Steps of centres are coarse from this share of a Gaussian's standard deviation on.
+/// Steps of centres from this share of a Gaussian's standard deviation on are coarse.
 const COARSE: f64 = 0.1;
 
 #[derive(Clone, Copy, Deserialize)]
@@ -144,8 +144,8 @@ fn logarithmic(means: &[f32]) -> (Vec<[f64; 3]>, [f64; 3], [f64; 3]) {
     (points, mins, maxs)
 }
 
-/// That the steps of centres are coarse beside the Gaussians, in words, where they are: they grow with the logarithm of the extremes, and with the distance
-/// from the origin.
+/// A message where the steps of centres are coarse compared with the Gaussians: steps grow with the logarithm of the extremes, and with the distance from the
+/// origin.
 fn coarse_steps(gaussians: &HostGaussians) -> Option<String> {
     let (points, mins, maxs) = logarithmic(&gaussians.means);
     // A step in the logarithmic domain is 1 + |x| times as long at x.

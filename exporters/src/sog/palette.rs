@@ -22,7 +22,7 @@ pub fn harmonics(gaussians: &HostGaussians, size: usize, iterations: usize) -> R
     // Evenly spread along the Morton curve, so that every region of the scene takes part.
     let samples = count.min(size.saturating_mul(SAMPLES));
     let sample: Vec<f32> = (0..samples).flat_map(|i| &vectors[(i as u64 * count as u64 / samples as u64) as usize * width..][..width]).copied().collect();
-    // Nothing here is random by choice: the seed only orders the start of k-means, the same for every model.
+    // A constant seed for the start of k-means, so that equal models give equal bytes.
     let centers = kmeans::cluster(&sample, width, size, iterations, Seed::root(0).child("sog-palette"));
     let labels = kmeans::assign(&vectors, width, &centers).labels;
     let book = Codebook::of(&centers);

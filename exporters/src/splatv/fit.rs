@@ -4,7 +4,7 @@ use crate::still::{sigmoid, unit};
 use cc4dgs_format::{Error, HostGaussians, Result};
 use rayon::prelude::*;
 
-/// A width in time that changes no opacity within the sequence; the largest half.
+/// A width in time that changes no opacity within the sequence: the largest half float.
 const FOREVER: f32 = 65504.0;
 /// Opacities that vary less than this over time, relative to the largest, are constant.
 const CONSTANT: f32 = 0.01;
@@ -26,7 +26,7 @@ pub struct Motion {
     pub powers: [[f32; 3]; 3],
     /// Change of the quaternion (w,x,y,z) per unit of time.
     pub turn: [f32; 4],
-    /// Where dt is zero.
+    /// The time at which dt is zero.
     pub center: f32,
     /// Width of the bell of the opacity.
     pub width: f32,
@@ -112,14 +112,14 @@ impl Samples {
 fn fit(times: &[f32], instants: &[Instant]) -> (Motion, Instant) {
     let opacities: Vec<f32> = instants.iter().map(|s| s.opacity).collect();
     let (center, width, opacity) = bell(times, &opacities);
-    // Halves, as the file holds them: the curves are fitted to the times that players see.
+    // Rounded to half floats, as the file holds them: curves are fitted to the times that players use.
     let [center, width] = [center, width].map(|v| half::f16::from_f32(v).to_f32());
     let highest = opacities.iter().fold(1e-9f32, |a, b| a.max(*b));
     let weights: Vec<f64> = opacities.iter().map(|o| UNSEEN + f64::from(o / highest).powi(2)).collect();
     let dts: Vec<f64> = times.iter().map(|t| f64::from(*t) - f64::from(center)).collect();
     let mean = |of: &dyn Fn(&Instant) -> f64| weights.iter().zip(instants).map(|(w, s)| w * of(s)).sum::<f64>() / weights.iter().sum::<f64>();
 
-    // The coefficients above the constant are rounded to halves first; the constant then makes up for the rounding where the Gaussian is seen.
+    // The coefficients above the constant are rounded to half floats first; the constant then compensates for the rounding where the Gaussian is seen.
     let degree = 3.min(times.len() - 1);
     let mut motion = Motion { center, width, ..Motion::resting() };
     let mut start = [0.0f32; 3];
@@ -282,7 +282,7 @@ mod tests {
             let (motion, constant) = fit(&times, &times.iter().map(at).collect::<Vec<Instant>>());
             let half = |v: f32| half::f16::from_f32(v).to_f32();
             assert!((motion.center - peak).abs() < 0.01 && motion.width < 0.3, "{motion:?}");
-            // What players see where the Gaussian is seen best, beside where it is: motion is linear, and its coefficient is a half.
+            // The centre that players compute where the Gaussian is seen best, against the true one: motion is linear, and its coefficient is a half float.
             let seen = constant.mean[0] + motion.powers[0][0] * (peak - half(motion.center));
             assert!((seen - 512.0 * peak).abs() < 0.02, "{seen} instead of {}", 512.0 * peak);
             assert_eq!((half(motion.center), half(motion.width)), (motion.center, motion.width));

@@ -113,7 +113,7 @@ fn record(out: &mut Vec<u8>, gaussians: &HostGaussians, row: usize, motion: &Mot
     halves(out, &[motion.center, motion.width]);
 }
 
-/// The nearest half; magnitudes over the range become the largest.
+/// The nearest half float; magnitudes over the range become the largest.
 fn half_bits(value: f32) -> u16 {
     f16::from_f32(value.clamp(-65504.0, 65504.0)).to_bits()
 }

@@ -12,7 +12,7 @@ use std::io::Write;
 const TEMPLATE: &str = include_str!("page.html");
 /// Modules inside one file have no addresses; they import each other by names with this prefix, which an import map resolves.
 const PREFIX: &str = "cc4dgs/";
-/// Starts the player of a single file from what the other elements hold.
+/// Starts the player of a single file from the contents of its other elements.
 const START: &str = r#"import { createPlayer } from "cc4dgs/player.js";
 const bytes = id => {
     const text = atob(document.getElementById(id).textContent), out = new Uint8Array(text.length);
@@ -34,7 +34,7 @@ if (!window.DecompressionStream || !HTMLScriptElement.supports || !HTMLScriptEle
 </script>
 "#;
 
-/// `text` where HTML shows it.
+/// `text` with the special characters of HTML escaped.
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
@@ -45,7 +45,7 @@ fn script_json(value: &Value) -> String {
 }
 
 fn document(title: &str, head: &str, body: &str) -> String {
-    // Parts of the template are replaced in one pass: what is put in may contain their names.
+    // Parts of the template are replaced in one pass, because the inserted text may contain their names.
     let mut out = String::with_capacity(TEMPLATE.len() + title.len() + head.len() + body.len());
     let mut rest = TEMPLATE;
     for (key, value) in [("{title}", escaped(title)), ("{head}", head.to_string()), ("{body}", body.to_string())] {
@@ -160,7 +160,7 @@ mod tests {
         other.files[0].1 = b"import { a } from \"./unknown.js\";".to_vec();
         assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.js"));
         let mut other = page();
-        other.files[6].1 = b"a { } </style><script>".to_vec();
+        other.files.iter_mut().find(|(name, _)| *name == "player.css").unwrap().1 = b"a { } </style><script>".to_vec();
         assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.css"));
     }
 

@@ -10,13 +10,13 @@ use cc4dgs_format::playback::{ComputedMotion, MAX_FUNCTIONS, MAX_SAMPLES, Motion
 use cc4dgs_format::{DeformerContext, HostGaussians, Plugin, Result, inventory, toml};
 use rayon::prelude::*;
 
-/// Memory at most, in floats: 256 MB.
+/// Upper bound on the memory, in floats: 256 MB.
 const MOST_FLOATS: u64 = 64 << 20;
-/// What a vertex takes beside its features, in floats: its position in the list and in the ordered map of vertices. And a Gaussian, for its centre in the box
-/// and the corners of its cell.
+/// Memory of a vertex besides its features, in floats: for the list and the ordered map of vertices. Memory of a Gaussian, for its centre in the box and the
+/// corners of its cell.
 pub(super) const FLOATS_OF_VERTEX: u64 = 12;
 pub(super) const FLOATS_OF_GAUSSIAN: u64 = 16;
-/// Multiplications at most: some ten seconds in a browser, and a second or two on a desktop.
+/// Upper bound on multiplications: some ten seconds in a browser, and a second or two on a desktop.
 const MOST_MULTIPLICATIONS: u64 = 20_000_000_000;
 /// Gaussians whose coefficients are computed at a time.
 const BLOCK: usize = 1024;
@@ -32,7 +32,7 @@ fn layer_head(head: Head, rotation: Rotation) -> Option<LayerHead> {
         Head::LogScales => Some(LayerHead::LogScales),
         Head::Quaternions if rotation == Rotation::Additive => Some(LayerHead::Rotations),
         Head::Sh => Some(LayerHead::Colors),
-        // Rotation vectors, and logits in front of the sigmoid.
+        // Offsets of rotation vectors and of opacity logits are not linear in a layer.
         Head::Quaternions | Head::Opacity => None,
     }
 }
@@ -45,7 +45,7 @@ pub(crate) fn stored(source: &MotionSource) -> Result<Option<ComputedMotion>> {
     motion(SpaceKind::Stored, source)
 }
 
-/// The plan of a deformer. Settings that are unknown here may be those of a layer around it. Baking builds both, and says what is wrong if anything is.
+/// The plan of a deformer; `None` for settings that are unknown here, which may be those of a layer around it. Baking builds both and reports wrong settings.
 fn plan_of(kind: SpaceKind, settings: &toml::Table, context: &DeformerContext) -> Option<BasisPlan> {
     let mut section = settings.clone();
     RATE_KEYS.iter().for_each(|key| _ = section.remove(*key));
@@ -123,10 +123,10 @@ fn coefficient_weights(plan: &BasisPlan, source: &MotionSource) -> Result<Vec<f3
     Ok(weights)
 }
 
-/// Largest factor of rotations. Beyond it, changes would be greater than layers may hold; what is added is all of the rotation long before.
+/// Largest factor of rotations. Beyond it, changes would exceed what layers may hold; far below it, the added quaternion already determines the rotation.
 const MOST_FACTOR: f64 = 1e15;
 
-/// What coefficients are multiplied by. Layers add to quaternions after those were divided by their norms.
+/// The factor of the coefficients. Layers add to normalised quaternions.
 fn factor(head: LayerHead, gaussians: &HostGaussians, gaussian: usize) -> f32 {
     if head != LayerHead::Rotations {
         return 1.0;

@@ -36,11 +36,11 @@ pub enum Rotation {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BasisSettings {
-    /// Width of the coefficient network; chosen by the features of space where absent.
+    /// Width of the coefficient network; `None`: by the kind of features.
     pub width: Option<usize>,
-    /// Its hidden layers; as its width.
+    /// Hidden layers of the coefficient network; `None`: by the kind of features.
     pub layers: Option<usize>,
-    /// Hidden layers of each head behind them.
+    /// Hidden layers of each head.
     pub head_layers: usize,
     /// Fourier bands; 0 chooses by the number of frames.
     pub time_bands: usize,

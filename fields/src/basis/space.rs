@@ -1,4 +1,4 @@
-//! Where the features of space come from that the coefficients are computed from: decoders, or tables.
+//! Features of space, from which coefficients are computed: by decoders, or from tables.
 
 use super::layer::{FLOATS_OF_GAUSSIAN, FLOATS_OF_VERTEX};
 use crate::settings::{Capacity, take};

@@ -24,7 +24,7 @@ impl Statistics {
             // Converts the gradient per pixel of a loss divided by the number of views to the gradient of the view's own loss per unit of normalised device coordinates.
             let scale = view.views as f32 * 0.5;
             let scale = [scale * view.size.0 as f32, scale * view.size.1 as f32];
-            // Moved out, so that nobody else holds it and it is changed in place.
+            // Moved out, so that this is the only reference and the kernel changes the tensor in place.
             let sums = std::mem::replace(&mut self.gradients, Tensor::empty([0, 2], &gradient.device()));
             self.gradients = add_gradients(sums, view.radii.clone(), gradient.clone(), scale)?;
         }

@@ -19,9 +19,9 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Frames per second where nobody states them.
+/// Frames per second, where neither the request nor the archive states them.
 const RATE: f64 = 30.0;
-/// The upward axis where nobody states it.
+/// The upward axis, where neither the request nor the archive states it.
 const UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 /// What to export of a model.
@@ -162,10 +162,10 @@ fn check_up(up: [f64; 3]) -> Result<()> {
     Err(Error::parameter("up", format!("{up:?} has the length {length}, and an axis has 1"), remedy))
 }
 
-/// Steps of float32 over the size of a Gaussian from which centres are visibly off.
+/// Spacing of float32 at a centre over the size of a Gaussian, from which the error of centres is visible.
 const COARSE: f64 = 0.1;
 
-/// What float32 does to the centres of `gaussians` in the dataset's coordinates, where this can be seen: an origin far away, as in maps, leaves few digits for them.
+/// A message where the rounding of the centres of `gaussians` to float32 is visible in the dataset's coordinates, because their origin is far away, as in maps.
 fn coarse(gaussians: &HostGaussians, to_dataset: &Similarity) -> Option<String> {
     let centres = gaussians.means.chunks_exact(3).map(|mean| to_dataset.apply(std::array::from_fn(|k| f64::from(mean[k]))));
     let farthest = centres.flatten().fold(0.0, |most: f64, v| most.max(v.abs())) as f32;
@@ -186,7 +186,7 @@ struct ModelSource<'a> {
     job: &'a ExportJob<'a>,
     player: Player<'a>,
     facts: ExportFacts,
-    /// Whether it was looked at what float32 does to centres.
+    /// Whether [`coarse`] was called.
     checked: bool,
 }
 
@@ -199,7 +199,7 @@ impl<'a> ModelSource<'a> {
         let frames = request.frames.unwrap_or(all).max(1);
         let up = request.up.unwrap_or(UP);
         let orbit = Orbit { frames: 1, up, ..Orbit::default() };
-        // A camera is a convenience; models that no orbit can look at have none.
+        // The home camera is optional: there is none if no orbit around the model is possible.
         let home = request.shots.first().map(|(camera, _)| camera.clone()).or_else(|| orbit.around(&model.gaussians).ok()?.pop());
         let facts = ExportFacts {
             name: job.out.file_stem().map_or_else(|| "model".into(), |stem| stem.to_string_lossy().into_owned()),

@@ -28,7 +28,7 @@ pub struct StressJob<'a> {
     pub device: &'a Device,
     /// The device of the oracle: one for processors.
     pub host: &'a Device,
-    /// Whether the two have kernels of their own. Where they share them, a comparison says nothing, and parts without float64 have no oracle.
+    /// Whether the two have kernels of their own. If they share kernels, a comparison shows no error, and parts without float64 have no oracle.
     pub other_kernels: bool,
     /// Name of the rasterizer under test.
     pub rasterizer: &'a str,

@@ -18,8 +18,8 @@ const COUNT: usize = 60;
 /// Gaussians of equal depth.
 const MANY: usize = 3000;
 
-/// Conditions and levels that are ordinary: every device must draw them. Of families of levels those that nothing speaks against, such as the first decade.
-/// Of moved scenes those at which float32 coordinates are finer than a hundredth of a pixel.
+/// Conditions and levels that are ordinary: every device must draw them. Of conditions with several levels those that float32 can represent, such as the first
+/// decade; of moved scenes those at which float32 coordinates are finer than a hundredth of a pixel.
 const ORDINARY: [(&str, &str); 15] = [
     ("an ordinary scene", "-"),
     ("coordinates far from the origin", "1e2"),
@@ -118,7 +118,7 @@ pub fn all() -> Vec<Hard> {
     }
     for decade in [-8, -6, -4, -2, 0, 1, 2, 3, 4] {
         let log = (10f32.powi(decade)).ln();
-        // Not round: the gradients of a sphere's rotation are zero, and their noise says nothing.
+        // Not spheres: the gradients of their rotation are zero, and would be noise alone.
         add("scales", format!("1e{decade}"), camera(0.0), &|g| {
             g.log_scales.as_chunks_mut::<3>().0.iter_mut().for_each(|scales| *scales = [log, log - 0.4, log + 0.3]);
         });

@@ -57,7 +57,7 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Re
         } else {
             None
         };
-        // The ends and no number first: a device with fewer levels still tries them.
+        // Both ends and NaN come first, so that devices with fewer levels try them, too.
         for time in [0.0f32, 1.0, f32::NAN, 2.0, 0.5, 1.0f32.next_up(), -1.0, 1e6].into_iter().take(job.deformer_levels) {
             let values = |device: &Device| -> Result<Vec<f32>> {
                 let deformer = shaken(job.registry, name, &settings, &context, device)?;
@@ -137,7 +137,7 @@ fn optimizer(job: &StressJob, decay: f64) -> Result<Compared> {
     Ok((to_vec(value, "values")?, Some((FLOAT64, exact.into_iter().map(|x| x as f32).collect()))))
 }
 
-/// Weights that half precision can hardly hold.
+/// Weights at the limits of half precision.
 fn weight_codec(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
     for (level, scale) in [("1e-30", 1e-30f32), ("1e-8", 1e-8), ("1e-4", 1e-4), ("1", 1.0), ("6e4", 6e4), ("1e6", 1e6), ("1e30", 1e30)] {
         let sized = case(&format!("weight codec {name}"), "size of the weights", level, || {
@@ -146,14 +146,14 @@ fn weight_codec(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
             let context = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
             let streams = codec.encode(&[WeightArray { name: "w".into(), shape: vec![500], values: values.clone() }], &context)?;
             let found = codec.decode(&streams, &context)?.into_iter().flat_map(|array| array.values).collect();
-            // The weights themselves: what is lost is lost by the codec.
+            // The oracle is the weights themselves: all differences are losses of the codec.
             Ok((found, Some(("the weights", values))))
         });
         note(sized.required_if(scale == 1.0));
     }
 }
 
-/// Images whose values explode. What a loss makes of them is bounded by the watchdog of the trainer; here it must not panic, and be finite where float32 can be.
+/// Images with ever larger values. A loss must not panic, and must be finite where float32 can represent it; in training the watchdog catches other values.
 fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
     const SIZE: [usize; 2] = [17, 23];
     let pixels = SIZE[0] * SIZE[1];

@@ -35,7 +35,7 @@ pub struct Bake {
     /// Leave the deformer's weights out. The archive is smaller and moves by its layer; it can be neither compressed again nor pruned.
     #[arg(long)]
     pub without_field: bool,
-    /// Frames per second of the recording; 30 where nobody says.
+    /// Frames per second of the recording; by default that of the archive, or 30.
     #[arg(long, value_name = "N")]
     pub fps: Option<f32>,
     /// The signed axis that points up: x, -x, y, -y, z or -z. By default that of the scene's cameras, or z.

@@ -97,7 +97,7 @@ fn storage<'a>(args: &'a Bake, registry: &Registry) -> Result<Option<Storage<'a>
     Ok(Some(Storage { codec, field_weights }))
 }
 
-/// What the archive said already, what the cameras say, and what the options say, the last first.
+/// Clock and cameras of the archive, overridden by those of `cameras` and of the options where these are given.
 fn shown(args: &Bake, stored: &Stored, cameras: &[Camera]) -> Result<Presentation> {
     let (up, before) = (args.up.map(Into::into), stored.presentation(cameras, None)?);
     let replaced = args.scene.is_some() || args.up.is_some();

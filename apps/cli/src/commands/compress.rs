@@ -22,7 +22,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-/// What compression came to.
+/// The result of compression.
 #[derive(Serialize)]
 pub struct CompressReport {
     pub archive: PathBuf,
@@ -103,7 +103,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     refuse_unused_views(&context.registry, args, has_weights, loaded.model.background.is_none())?;
     let scene =
         args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &scene_sets, &context.registry, &context.limits)).transpose()?.map(Arc::new);
-    // A PLY says nothing of what is behind it.
+    // PLY files state no background.
     loaded.model.background = loaded.model.background.or(scene.as_ref().and_then(|scene| scene.background));
     let tuner = scene.as_ref().map(|scene| {
         let (registry, limits, events) = (&context.registry, &context.limits, &events);

@@ -106,7 +106,7 @@ fn default_sheet(model: &Path, split: Split, json_file: Option<&Path>) -> PathBu
     }
 }
 
-/// Refuses a contact sheet in place of a file that is no PNG image, and of one in the folder of the scene, which may be one of its images.
+/// Refuses to replace a file that is no PNG image by a contact sheet, and a file in the folder of the scene, which may be one of its images.
 fn check_sheet(sheet: &Path, scene: &Path, overwrite: bool) -> Result<()> {
     refuse_other_content(sheet, "a PNG image", |head| head.starts_with(PNG))?;
     if !overwrite && lies_in(sheet, scene) {
@@ -140,7 +140,7 @@ pub struct Subject<'a> {
     path: &'a Path,
     loaded: &'a Loaded,
     scene: Scene,
-    /// What moves how, where the scene is built in and the model was trained on all of its frames.
+    /// The scene with its known motion, if it is built in and the model was trained on all of its frames.
     truth: Option<ProceduralScene>,
 }
 

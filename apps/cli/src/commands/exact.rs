@@ -67,8 +67,8 @@ fn described(model: &Model, device: &str) -> String {
 
 impl ExactImages for ModelImages {
     fn serve(&mut self, requests: &ExactRequests) -> Result<()> {
-        // A pool of its own: a parallel operation then starts on the thread that asks for it, as in all commands, and a thread that waits for the next request
-        // is none that others need.
+        // A pool of its own: a parallel operation then starts on the thread that calls it, as in all commands, and the thread that waits for requests is not
+        // missing in the common pool.
         let pool = rayon::ThreadPoolBuilder::new().num_threads(rayon::current_num_threads()).stack_size(STACK).build();
         let pool = pool.map_err(|e| Error::backend("exact images", e.to_string(), "Give fewer --threads"))?;
         pool.install(|| {
@@ -116,7 +116,7 @@ mod tests {
         woken.recv_timeout(PATIENCE).expect("an answer");
         let image = worker.take().unwrap();
         assert_eq!(&image.view, view);
-        // The worker waits now, for as long as the window is open: no thread that others compute on.
+        // The worker waits while the window is open, on a thread that does not belong to the common pool.
         let (answer, answered) = channel();
         std::thread::spawn(move || answer.send(rayon::broadcast(|_| ()).len()));
         answered.recv_timeout(PATIENCE).expect("all threads of the pool are free");

@@ -110,7 +110,7 @@ fn has_one(plugin: &ExporterPlugin, capabilities: &[&str]) -> bool {
     capabilities.iter().any(|capability| plugin.info.capabilities.contains(capability))
 }
 
-/// Other programs go by the ending of a file.
+/// Refuses other endings than that of the format, by which other programs recognise it.
 fn check_name(out: &Path, target: ExportTarget, format: &str) -> Result<()> {
     match target.at(out) {
         ExportTarget::File(extension) if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case(extension)) => {
@@ -178,7 +178,7 @@ mod tests {
         let of = |capabilities: &'static [&'static str]| ExporterPlugin {
             info: Plugin { name: "usd", version: "1", summary: "", paper: "", schema: "", capabilities },
             target: ExportTarget::File("usd"),
-            build: |_| Err(Error::parameter("usd", "it is built by nobody", "Leave it")),
+            build: |_| Err(Error::parameter("usd", "it cannot be built", "Leave it")),
         };
         let registry = Registry::collect().unwrap();
         let all = "--frames 3 --fps 24 --scene a --split train --size 64x48";

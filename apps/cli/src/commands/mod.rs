@@ -148,7 +148,7 @@ fn no_window(command: String) -> Error {
     Error::unsupported(command, "the window is left out of this build", remedy)
 }
 
-/// Creates the folder that the file `path` will be written to, and refuses a folder in its place, before any long work that would be lost.
+/// Creates the folder of the file `path`, and refuses a `path` that is a folder, before any long work that would be lost.
 pub fn create_parent(path: &Path) -> Result<()> {
     refuse_existing(path, true)?;
     match path.parent().filter(|p| !p.as_os_str().is_empty()) {

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// What pruning came to.
+/// The result of pruning.
 #[derive(Serialize)]
 struct Report {
     archive: PathBuf,
@@ -35,7 +35,7 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     loaded.model.check_storable()?;
     say_what_is_lost(context, &args.model, &events)?;
     let scene = open_as_trained(&args.scene, &loaded.model, &args.sets, &context.registry, &context.limits)?;
-    // A PLY says nothing of what is behind it.
+    // PLY files state no background.
     loaded.model.background = loaded.model.background.or(scene.background);
     let (registry, limits, events) = (&context.registry, &context.limits, &events);
     let found = match args.refit {

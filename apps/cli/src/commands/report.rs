@@ -6,7 +6,7 @@ use crate::ignored::{Stated, refuse_ignored};
 use cc4dgs_core::{Result, plural};
 use cc4dgs_train::report::{ImageChoice, ReportOptions, write_report};
 
-/// Views per scene that images are shown of, where it is not said.
+/// Default of --views.
 const VIEWS: u16 = 3;
 
 pub fn run(context: &Context, args: &Report) -> Result<()> {

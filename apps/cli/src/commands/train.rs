@@ -34,7 +34,7 @@ pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> 
         None if args.resume && args.preset.is_none() && own.exists() => Some(own.as_path()),
         given => given.as_deref(),
     };
-    // Without a word on settings, the scene is looked at.
+    // Without preset and configuration, `auto` chooses settings for the scene.
     let preset = args.preset.as_deref().or((file.is_none()).then_some(auto::PRESET));
     refuse_overruled(&args.sets, "auto.minutes", "--minutes", args.minutes.is_some())?;
     let minutes = args.minutes.map(|minutes| format!("auto.minutes={minutes}"));
@@ -91,7 +91,7 @@ pub struct Trained {
     pub scene: String,
     /// The settings, with what the preset `auto` chose.
     pub config: RunConfig,
-    /// What came of it.
+    /// Its report.
     pub report: TrainReport,
 }
 

@@ -26,7 +26,7 @@ const PAUSE: u32 = 19;
 /// Hands snapshots to a window.
 struct Watcher {
     live: Arc<Live>,
-    /// When the last snapshot was asked for, and when the next may be.
+    /// When the last snapshot was requested, and when the next one may be.
     times: Mutex<(Instant, Instant)>,
 }
 
@@ -81,12 +81,12 @@ pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> 
         });
         let shown = show(&title, Shown::Training(live));
         if shown.as_ref().is_err_and(|e| !matches!(e, Error::Backend { .. })) {
-            // A training that cannot be watched was not asked for; it leaves a checkpoint. One whose window lost its device goes on.
+            // Without a window the training stops with a checkpoint, because `--view` asked for one. If the window has lost its device, the training goes on.
             stop.store(true, Ordering::Relaxed);
         }
         let trained = training.join().unwrap_or_else(|_| Err(panicked()));
         match (shown, trained) {
-            // The training went on without its window, and is what counts.
+            // The window lost its device; the result of the training counts.
             (Err(lost @ Error::Backend { .. }), trained) => {
                 writeln!(std::io::stderr(), "warning: {lost}").ok();
                 trained

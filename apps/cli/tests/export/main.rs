@@ -23,7 +23,7 @@ fn train(out: &Path, deformer: &str, sh_degree: usize) {
     succeed(&args);
 }
 
-/// Draws the model, and the same cameras with other Gaussians (of the dataset's coordinates) in its place.
+/// Draws the model, and other Gaussians (in the dataset's coordinates) with the same cameras.
 struct Judge {
     session: Session,
     run: PathBuf,

@@ -64,9 +64,9 @@ struct TileGradient {
     /// Upstream of red, green, blue, depth.
     upstream: [TilePlane; 4],
     apart: Gap,
-    /// Transmittance behind the Gaussian at hand.
+    /// Transmittance behind the current Gaussian.
     running: TilePlane,
-    /// The loss's part behind the Gaussian at hand.
+    /// The part of the loss behind the current Gaussian.
     behind: TilePlane,
     /// Bits of rows with any upstream gradient.
     live_rows: u32,

@@ -201,7 +201,7 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
     }
 }
 
-/// What flows into a [`Projection`].
+/// The upstream gradients of a [`Projection`].
 pub struct ProjectionGradient<S: Simd> {
     /// d loss / d centre in pixels.
     pub center: [Lanes<S>; 2],
@@ -213,7 +213,7 @@ pub struct ProjectionGradient<S: Simd> {
     pub compensation: Lanes<S>,
 }
 
-/// What flows out of a [`Projection`].
+/// The gradients of the inputs of a [`Projection`].
 pub struct GeometryGradient<S: Simd> {
     /// d loss / d centre in world units.
     pub mean: Vec3<S>,

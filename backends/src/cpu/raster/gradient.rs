@@ -152,7 +152,7 @@ struct GradientChunk<'a> {
     out: [&'a mut [f32]; OUTPUTS],
 }
 
-/// Arrays with a row per Gaussian, and which is which.
+/// Number of output arrays with a row per Gaussian, and their indices.
 const OUTPUTS: usize = 8;
 const MEANS: usize = 0;
 const SCALES: usize = 1;
@@ -165,7 +165,7 @@ const ABSOLUTE_SCREEN: usize = 7;
 
 /// Staged columns of the screen side: the record, then 1 per colour channel that is not clamped at zero.
 const SCREEN_ROWS: usize = RECORD + 3;
-/// Numbers that flow into the camera: rotation, translation, centre.
+/// Rows of the gradient of the camera: rotation, translation, centre.
 const CAMERA_ROWS: usize = 15;
 
 impl WithSimd for GradientChunk<'_> {

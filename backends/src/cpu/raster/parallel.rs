@@ -1,4 +1,4 @@
-//! Work sharing among rayon's threads: independent numbered tasks, handed out in order. What a task computes never depends on who runs it.
+//! Work sharing among rayon's threads: independent numbered tasks, handed out in order. The result of a task never depends on the thread that runs it.
 
 use std::marker::PhantomData;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -50,7 +50,7 @@ impl<'a, T> SharedMut<'a, T> {
     ///
     /// # Safety
     /// No two live results may overlap.
-    #[allow(clippy::mut_from_ref)] // The whole point: disjoint parts of one slice.
+    #[allow(clippy::mut_from_ref)] // Intended: callers get disjoint parts of one slice.
     #[inline(always)]
     pub unsafe fn slice(&self, from: usize, len: usize) -> &mut [T] {
         assert!(from <= self.len && len <= self.len - from);

@@ -13,7 +13,7 @@ const POOLED_BYTES: usize = 2 << 30;
 
 static POOL: Mutex<Vec<Buffers>> = Mutex::new(Vec::new());
 
-/// Where the footprint {sigma <= cutoff} of a Gaussian reaches, for cutting it by columns.
+/// Extent of the footprint {sigma <= cutoff} of a Gaussian, for its intersection with columns of pixels.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Footprint {
     /// Half height in pixels.

@@ -159,7 +159,7 @@ fn multiply(layer: &MishLayer, target: Target) -> Step {
     Step::Multiply { source: 0, target, input, output, weights, bias: Some(layer.bias.start), relu: false, add: false }
 }
 
-/// Rows of a plan that is made only to look at its widths.
+/// Number of rows of a plan that is made for its widths alone.
 const ANY_ROWS: usize = 16;
 
 /// The steps forwards.
@@ -206,7 +206,7 @@ struct Saved {
     before_norm: usize,
 }
 
-/// The steps forwards and backwards, and where in the output buffer they save what.
+/// The steps forwards and backwards, and where in the output buffer each layer's values are saved.
 struct Plan {
     program: Program,
     /// By layer.
@@ -229,7 +229,7 @@ fn plan(layers: &[MishLayer], rows: usize) -> Plan {
         steps.push(Step::Save { tile: 0, width: layer.input, at: own.input });
         let width = layer.output;
         if i > 0 {
-            // Backwards, this comes before what the layer in front does.
+            // `back` is reversed below: backwards, this step comes before those of the layer in front.
             let (weights, target) = (transposed + layer.weight.start, Target::Tile(0));
             back.push(Step::Multiply { source: 0, target, input: width, output: layer.input, weights, bias: None, relu: false, add: false });
         }

@@ -275,12 +275,12 @@ pub struct Sums<'a> {
     pub rows: usize,
     /// Whether they are added to what is there.
     pub add: bool,
-    /// The vertices of all rows `[_,3]` and which of them is that of row 0, where rows may hold none.
+    /// The vertices `[_,3]`, and the index of the one of row 0; `None` if every row counts. Rows without a vertex come last and are left out.
     pub listed: Option<(&'a CubeTensor, usize)>,
 }
 
 impl Sums<'_> {
-    /// The vertices to look at, or anything of their kind, and which is the first.
+    /// The vertices and the index of that of row 0; without vertices any integer tensor, which the kernels do not read.
     fn vertices(&self) -> (CubeTensor, u32) {
         self.listed.map_or_else(|| (signed(self.gradient.clone()), 0), |(vertices, first)| (vertices.clone(), first as u32))
     }

@@ -29,7 +29,7 @@ fn run(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, rows: usize) -> 
     (outputs, flat)
 }
 
-/// Trunk and heads as steps: the trunk works in one tile, heads in another, because each of them reads what the trunk ends with.
+/// Trunk and heads as steps: the trunk works in one tile, heads in another, because every head reads the output of the trunk.
 struct Tree {
     layers: Vec<Layer>,
     /// Where each layer's output starts among the flat outputs, if it is one.
@@ -40,7 +40,7 @@ struct Tree {
 
 const TRUNK: usize = 0;
 const HEAD: usize = 1;
-/// Rows of a plan that is made only to look at its widths.
+/// Number of rows of a plan that is made for its widths alone.
 const ANY_ROWS: usize = 16;
 
 impl Tree {
@@ -103,7 +103,7 @@ struct Saved {
     gradient: usize,
 }
 
-/// The steps forwards and backwards, and where in the output buffer they save what.
+/// The steps forwards and backwards, and where in the output buffer each layer's values are saved.
 struct Plan {
     program: Program,
     /// By layer.
@@ -157,7 +157,7 @@ fn plan(tree: &Tree, rows: usize, wants_input: bool) -> Plan {
             }
         }
     }
-    // Then what the heads add to the gradient of what the trunk ends with.
+    // Then the gradient of the trunk's output: a sum over the heads.
     let mut begun = false;
     for (i, layer) in tree.layers.iter().enumerate().skip(tree.trunk).rev() {
         if layer.parent.is_some_and(|p| p >= tree.trunk) || (layer.parent.is_none() && !wants_input) {

@@ -31,7 +31,7 @@ pub fn backward(
     let (width, height) = (settings.width, settings.height);
     let tiles_x = width.div_ceil(TILE);
     let rules = RuleConstants::new(settings);
-    // Asked for in the forward pass, which has made sure that the records fit.
+    // Set before the forward pass, which has checked that the larger records fit.
     let absolute = request.absolute_screen && settings.absolute_centers;
     let stride = blend::record_floats(absolute);
     let records = floats(&means, [lists.pairs, stride]);

@@ -1,7 +1,8 @@
 //! Which tiles of a footprint's box its ellipse meets: pairs with the others would draw nothing.
 //!
 //! The box is divided into up to 32 cells, eight along its longer side and four along the other, of whole tiles; a bit says whether the ellipse meets a cell.
-//! Up to eight by four tiles, each is a cell of its own. The bits are stored, so that whoever counts pairs and whoever lists them agree whatever their compilers round.
+//! Up to eight by four tiles, each is a cell of its own. The bits are stored, so that the kernels that count and that list pairs agree, however compilers
+//! round.
 
 use super::geometry::Projected;
 use crate::ops::rasterize::TILE;

@@ -148,7 +148,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
             tiles_x as u32,
         );
         if capacity.is_some() {
-            // What no Gaussian filled goes behind the last tile.
+            // Unused pairs get a tile behind the last one.
             let (tile, own) = (tile_of_pair.clone().into_buffer_arg(), pair.clone().into_buffer_arg());
             lists::fill_unused::launch(&client, workgroups_for(pairs), DIM(), tile, own, total.clone().into_buffer_arg(), tiles as u32);
         }

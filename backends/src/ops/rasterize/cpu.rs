@@ -85,7 +85,7 @@ fn narrow(values: Vec<f64>) -> Vec<f32> {
     values.into_iter().map(|v| v as f32).collect()
 }
 
-/// What the reference's backward pass needs of its forward pass.
+/// What the backward pass of the reference needs from its forward pass.
 struct Drawn {
     precision: Precision,
     items: Vec<Item>,

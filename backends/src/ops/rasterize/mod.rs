@@ -205,7 +205,7 @@ pub struct RasterInputs {
     pub background: Option<Tensor<1>>,
 }
 
-/// An error for a device without the operation, or without what its settings ask for.
+/// An error for a device without the operation, or without the method or shortcuts that are asked for.
 fn check_device(device: &Device, method: Method, shortcuts: Shortcuts) -> Result<()> {
     match (device.clone().without_autodiff().as_dispatch(), method, shortcuts == Shortcuts::default()) {
         (DispatchDevice::Flex(_), ..) => Ok(()),
@@ -234,7 +234,7 @@ pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method)
     let device = inputs.means.device();
     check_device(&device, method, settings.shortcuts)?;
     check_binding(&device, "render", "pixels", settings.width * settings.height, PLANES * size_of::<f32>())?;
-    // What is absent still needs a tensor: probes are never read, and no background is black.
+    // Absent inputs need a tensor, too: probes are never read, and an absent background is black.
     let absent = || Tensor::<1>::empty([3], &device).into_dispatch();
     let black = || Tensor::<1>::zeros([3], &device).into_dispatch();
     let wants_weights = settings.max_weights;

@@ -1,4 +1,4 @@
-//! What every device agrees on: the numbers of a render, the size of a tile, the columns of a record.
+//! What all devices share: the numbers of a render, the size of a tile, the columns of a record.
 
 use cc4dgs_core::{ParameterSpace, Rules};
 

@@ -105,7 +105,7 @@ pub fn blend<T: Real>(items: &[Item], settings: &RasterSettings, background: [f6
     image
 }
 
-/// What flows out of [`blend`].
+/// The gradients of the inputs of [`blend`].
 pub struct BlendGradients {
     /// Of the numbers of every item.
     pub items: Vec<[f64; RECORD]>,
@@ -166,7 +166,7 @@ pub fn blend_backward<T: Real>(items: &[Item], settings: &RasterSettings, backgr
     out
 }
 
-/// How near the decisions at a pixel are to falling the other way.
+/// How near the decisions at a pixel are to the opposite outcome.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Margin {
     /// The least relative distance of an alpha from 1/255 or from its cap, or of a transmittance from where a pixel stops. The transmittance behind capped

@@ -1,7 +1,7 @@
 //! The rasterizer `reference`: slow, obvious, float64. It is the oracle of `tile` and shares no arithmetic with it: geometry is
 //! differentiated by carrying derivatives along ([`real::Dual`]), blending pixel by pixel over the whole list.
 //!
-//! The same formulas in float32 ([`Precision::Float32`]) show what rounding alone does to them: the noise that a float32 kernel is measured by.
+//! The same formulas in float32 ([`Precision::Float32`]) show the error of rounding alone, with which the error of a float32 kernel is compared.
 
 // Formulas with indices read as in the papers.
 #![allow(clippy::needless_range_loop)]

@@ -58,7 +58,7 @@ impl TuneModel for Trainer {
         // Scores are the indices of the rows, whose order may change.
         let rows = gaussians.dynamic_scores.iter().zip(gaussians.sh_dc.chunks_exact(3));
         let squares = rows.flat_map(|(&row, found)| found.iter().zip(&self.colors[3 * row as usize..])).map(|(a, b)| f64::from(a - b).powi(2));
-        // Training makes up for most of what rounding costs.
+        // Training compensates for most of the loss by rounding.
         let cost = self.cost * if weights[0].values[0] > 0.0 { self.remains } else { 1.0 };
         let psnr = 40.0 - cost * squares.sum::<f64>() / self.colors.len() as f64 + self.gain * f64::from(weights[0].values[0]);
         self.measured.borrow_mut().insert(weights[0].values[0] as u32, psnr);
@@ -103,7 +103,7 @@ fn what_is_allowed_is_used_whatever_training_gains() {
         let attempt = job.attempt(0.01).unwrap().0;
         let streams = job.streams(job.planner.gaussians, &attempt.plan).unwrap();
         for (limit, gain) in [(0.05, 0.0), (0.05, 3e-4), (0.05, 1.5e-3), (0.3, 5e-4), (0.05, -1e-5)] {
-            // What needs no training loses almost what is allowed.
+            // The result without training loses almost as much as is allowed.
             let trainer = Trainer::of(&attempt, job, 0.99 * limit, gain);
             let found = Untuned { attempt: &attempt, streams: &streams, allowed: true };
             let tuned = tune(job, &found, &Goal::Drop(limit), &Settings::default(), &trainer, context).unwrap();
@@ -158,7 +158,7 @@ fn where_nothing_is_allowed_the_nearest_is_kept() {
     });
 }
 
-/// Views that are there and never asked for.
+/// Views whose images are never read.
 struct Unseen;
 
 impl TrainingViews for Unseen {
@@ -340,7 +340,7 @@ fn a_round_follows_where_the_last_one_missed() {
         let attempt = job.attempt(0.01).unwrap().0;
         let streams = job.streams(job.planner.gaussians, &attempt.plan).unwrap();
         let found = Untuned { attempt: &attempt, streams: &streams, allowed: true };
-        // Training makes up for as much as is expected, and for less.
+        // Training compensates for as much as expected, and for less.
         for (remains, rounds) in [(0.3, 5), (0.7, 6)] {
             let trainer = Trainer { remains, ..Trainer::of(&attempt, job, 0.0499, 0.0) };
             let tuned = tune(job, &found, &Goal::Drop(0.05), &Settings::default(), &trainer, context).unwrap();

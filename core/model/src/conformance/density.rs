@@ -189,7 +189,7 @@ impl Suite<'_> {
     fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
         let mut odd = self.gaussians(5);
         odd.means = Tensor::from_floats([[f32::NAN, 0.0, 0.0], [f32::INFINITY, 0.0, 0.0], [0.0; 3], [0.0; 3], [0.0; 3]], self.device);
-        // A faint one has something to gain from the others, and one whose opacity is not a number has nothing to give.
+        // A control may move the faint Gaussian onto the others, but must not copy the one whose opacity is NaN.
         odd.opacity_logits = Tensor::from_floats([2.0, 2.0, -8.0, f32::NAN, 2.0], self.device);
         for gaussians in [self.gaussians(1), odd] {
             let mut control = self.build()?;

@@ -7,17 +7,17 @@ use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 
 /// Image size of the suite.
 const SIZE: [usize; 2] = [17, 23];
-/// Every so many pixels the depth of one is unknown.
+/// The depth of every n-th pixel is unknown, for this n.
 const UNKNOWN: usize = 5;
 /// Gaussians of the suite.
 const COUNT: usize = 6;
-/// How far apart a value as drawn and the canonical one are, at most.
+/// Largest difference between a value as drawn and the canonical one.
 const OFFSET: f32 = 0.3;
 /// What findings write before the name of a canonical column.
 const CANONICAL: &str = "canonical ";
 /// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.05;
-/// By how much values change that have no gradient, and the largest relative change of the loss then.
+/// Change of values that have no gradient, and the largest relative change of the loss that is allowed for it.
 const MOVE: f32 = 0.01;
 const UNMOVED: f64 = 1e-5;
 /// Largest relative difference between a fused term and the sum of its parts.

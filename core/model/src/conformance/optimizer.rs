@@ -9,7 +9,7 @@ use burn::tensor::{Device, Int, Tensor};
 const SHAPE: [usize; 2] = [12, 3];
 /// Number of steps in which a quadratic function must fall to a tenth or less.
 const STEPS: usize = 400;
-/// Steps after which fresh rows are compared with their parents, and how many times as far they may have moved.
+/// Steps after which fresh rows are compared with their parents, and upper bound on the ratio of the distances that they have moved.
 const FRESH_STEPS: usize = 20;
 const FRESH_MOVES: f64 = 2.0;
 

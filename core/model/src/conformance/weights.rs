@@ -1,4 +1,4 @@
-//! What the suites of models with weights share: reading weights, changing them, and holding gradients to finite differences.
+//! What the suites of models with weights share: reading weights, changing them, and comparing gradients with finite differences.
 
 use super::within;
 use crate::gaussians::to_vec;
@@ -33,8 +33,8 @@ fn of(values: Vec<f32>, device: &Device) -> Tensor<1> {
     Tensor::from_data(TensorData::new(values, [count]), device)
 }
 
-/// Holds the `gradients` of the weights of `model` to finite differences of `measure` with steps of size `step`: along each array's gradient, which shows errors of
-/// its size, and by single numbers, which shows those that are missing in it. Returns a finding, if any.
+/// Compares the `gradients` of the weights of `model` with finite differences of `measure` with steps of size `step`: along each array's gradient, which shows
+/// errors of its size, and by single numbers, which shows those that are missing in it. Returns a finding, if any.
 pub(super) fn slopes<M: ?Sized>(
     model: &mut M,
     parameters: impl for<'a> Fn(&'a M) -> Vec<&'a Parameter>,

@@ -1,5 +1,5 @@
 //! FLIP for images of low dynamic range, after the formulas of Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström and Fairchild, "FLIP: A Difference
-//! Evaluator for Alternating Images" (2020): how visible a difference is to somebody who flips between the two images, from 0 (none) to 1.
+//! Evaluator for Alternating Images" (2020): how visible a difference is to an observer who flips between the two images, from 0 (none) to 1.
 //!
 //! A colour branch filters both images with the contrast sensitivity of the eye and compares them in CIELab. A feature branch compares edges and points
 //! of the luminance. The second raises the first to a power. Both depend on how many pixels the eye sees per degree.

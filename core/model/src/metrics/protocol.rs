@@ -69,7 +69,7 @@ pub struct FrameSet {
     pub count: usize,
     /// Number of images of the split.
     pub of: usize,
-    /// What is behind them, RGB in 0..1, where they are transparent: contours are scored on it.
+    /// Background behind transparent pixels, RGB in 0..1; it changes the scores of contours.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub background: Option<[f32; 3]>,
 }

@@ -115,7 +115,7 @@ struct CloneSplit {
     statistics: Statistics,
     /// The actions of the last plan.
     due: Due,
-    /// Places of `max_gaussians` that the next plan leaves empty.
+    /// How many of `max_gaussians` the next plan must leave unused.
     held: usize,
 }
 
@@ -171,7 +171,7 @@ impl DensityControl for CloneSplit {
         Ok(plan)
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
-        // Somebody else may have changed the rows.
+        // The plan may be one of the trainer, which changes the rows, too.
         if self.due.grow || self.due.prune_weight || !plan.keeps_all(self.statistics.len()) {
             self.statistics = self.statistics.after(plan, self.due.prune_weight, device)?;
         }

@@ -19,7 +19,7 @@ pub(super) struct Due {
     pub prune_weight: bool,
     /// Lower all opacities.
     pub reset: bool,
-    /// How many Gaussians growth stays below `max_gaussians`.
+    /// How many of `max_gaussians` growth must leave unused.
     pub held: usize,
 }
 

@@ -1,4 +1,4 @@
-//! A budget of Gaussians that goes where the images need it (3DGS-MCMC, with growth by score and halves along the longest axis as in ImprovedGS).
+//! A budget of Gaussians that is distributed by what images need (3DGS-MCMC, with growth by score and halves along the longest axis as in ImprovedGS).
 //!
 //! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves of a
 //! split together draw nearly what the whole drew, so that a round costs little.
@@ -143,7 +143,7 @@ impl DensityControl for Mcmc {
         self.statistics.add_gradients(view)?;
         self.weights.add(view)?;
         if self.settings.decay > 0.0 {
-            // Of several views one is enough.
+            // A Gaussian counts as shown if one of the views shows it.
             self.shown = Some(match self.shown.take() {
                 Some(before) => before.max_pair(view.radii.clone()),
                 None => view.radii.clone(),
@@ -163,11 +163,11 @@ impl DensityControl for Mcmc {
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
         let (before, own) = (self.statistics.len(), std::mem::take(&mut self.round));
-        // What others add, such as points of key frames, is no growth.
+        // Gaussians that the trainer adds, such as points of key frames, do not count as growth of this control.
         if !own {
             self.start += plan.len().saturating_sub(before);
         }
-        // A round starts over; so do the statistics when somebody else changed the rows.
+        // Statistics start anew after a round, and after a plan of the trainer that changes the rows.
         if own || !plan.keeps_all(before) {
             self.statistics = Statistics::zeros(plan.len(), device);
             self.weights = self.weights.after(plan, own, device)?;
@@ -305,7 +305,7 @@ mod tests {
             let found = control.state().into_iter().find(|(name, _)| name == "rounds").unwrap().1;
             to_vec(found, "rounds").unwrap()
         };
-        // Points of key frames, say; then broken rows are removed.
+        // As the trainer adds points of key frames, then removes rows that are not finite.
         let mut added = DensityPlan::unchanged(2);
         added.copy(0);
         control.executed(&added, &device).unwrap();

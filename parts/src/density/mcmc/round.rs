@@ -1,12 +1,12 @@
-//! One round: faded and hidden Gaussians make room for halves of others.
+//! One round: faded and hidden Gaussians are removed, and as many others are split into halves.
 
 use super::Settings;
 use crate::density::halves;
 use cc4dgs_core::{DensityPlan, HostGaussians, Seed};
 use rand::Rng;
 
-/// The plan of one round: which of the Gaussians are removed, kept and split, so that there are at most `budget`. `scores` say who is split `[N]`; of the rows
-/// `hidden` the first are moved, as far as others can be split in their place.
+/// The plan of one round: which of the Gaussians are removed, kept and split, so that there are at most `budget`. `scores` `[N]` are the weights
+/// with which Gaussians are drawn for splitting. Of the rows `hidden` the first are relocated: removed, as many as others can be split for.
 pub(super) fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], hidden: &[usize], budget: usize, seed: Seed) -> DensityPlan {
     let n = host.len();
     let opacity = |row: usize| 1.0 / (1.0 + (-host.opacity_logits[row]).exp());
@@ -19,13 +19,13 @@ pub(super) fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], h
     let mut goes = vec![false; n];
     hidden.iter().for_each(|&row| goes[row] = true);
     let stays: Vec<usize> = alive.iter().copied().filter(|&row| !goes[row]).collect();
-    // The trainer may keep faded rows; they count where there are more than the budget.
+    // The trainer may have kept faded rows: the number above the budget is subtracted.
     let over = (0..n).filter(|&row| host.is_finite(row)).count().saturating_sub(budget);
     let slots = budget.saturating_sub(stays.len() + over).min((settings.growth * n as f64).ceil() as usize);
     let drawn = drawn(&stays, scores, slots, seed);
     let mut splits = vec![false; n];
     drawn.iter().for_each(|&row| splits[row] = true);
-    // Where too few others can be split, the last of the hidden stay. What the trainer kept of earlier plans may be above the budget, and goes.
+    // If too few others can be split, the last hidden rows stay, up to the budget: rows that the trainer kept of earlier plans may exceed it.
     let missing = alive.len().min(budget).saturating_sub(stays.len() + drawn.len());
     let moved = hidden.len().saturating_sub(missing);
     hidden[moved..].iter().for_each(|&row| goes[row] = false);
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn faded_gaussians_make_room_for_halves_of_those_with_gradients() {
+    fn faded_gaussians_are_replaced_by_halves_of_those_with_gradients() {
         let mut host = host_of(&[0.5, 0.001, 0.5, 0.5, 0.5]);
         host.means[12] = f32::NAN;
         let settings = Settings { growth: 1.0, ..Default::default() };
@@ -86,7 +86,7 @@ mod tests {
         let above = round(&settings, &host_of(&[0.5, 0.5, 0.5, 0.001, 0.001]), &[1.0; 5], &[], 4, Seed::root(1));
         assert_eq!((above.parents(), above.report.split), (&[0, 1, 2][..], 0), "faded rows that the trainer may keep are above the budget");
         assert!(round(&settings, &host_of(&[0.001; 3]), &[1.0; 3], &[], 9, Seed::root(1)).keeps_all(3), "never all of them");
-        // At the budget, the hidden one makes room for halves of the only other with a gradient; without one, it stays.
+        // At the budget, the hidden row is removed and the only other row with a gradient is split; if no other has a gradient, the hidden row stays.
         let plan = round(&settings, &host_of(&[0.5; 4]), &[1.0, 0.0, 1.0, 0.0], &[2], 4, Seed::root(1));
         assert_eq!((plan.parents(), plan.report.moved, plan.report.split), (&[0, 0, 1, 3][..], 1, 0));
         assert!(round(&settings, &host_of(&[0.5; 4]), &[0.0, 0.0, 1.0, 0.0], &[2], 4, Seed::root(1)).keeps_all(4));

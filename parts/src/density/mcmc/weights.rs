@@ -5,12 +5,12 @@ use cc4dgs_backends::ops::view_sums::add_weights;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Result, ViewStatistics};
 
-/// Share of the sums of blending weights that a round leaves to the next: a round alone has not seen every view.
+/// Share of the sums of blending weights that is kept after a round, because one round does not draw every view.
 const MEMORY: f32 = 0.7;
-/// Rounds after which a Gaussian is judged by its blending weights: until then, halves are still fainter than they will be.
+/// Rounds after which a Gaussian is judged by its blending weights: until then, halves are fainter than after training.
 const LEAST_ROUNDS: f32 = 3.0;
 
-/// What is remembered of the blending weights of N Gaussians: sums over views, of which every round leaves a share to the next.
+/// Blending weights of N Gaussians: sums over views, which decay with every round.
 pub(super) struct Weights {
     /// Of the largest weight, of its square, and of views that show the Gaussian `[N,3]`.
     pub sums: Tensor<2>,
@@ -24,14 +24,14 @@ impl Weights {
     }
     pub fn add(&mut self, view: &ViewStatistics) -> Result<()> {
         if let Some(weights) = &view.max_weights {
-            // Moved out, so that nobody else holds it and it is changed in place.
+            // Moved out, so that this is the only reference and the kernel changes the tensor in place.
             let sums = std::mem::replace(&mut self.sums, Tensor::empty([0, 3], &weights.device()));
             self.sums = add_weights(sums, view.radii.clone(), weights.clone())?;
         }
         Ok(())
     }
-    /// Of the rows that can be judged, at most so many with the smallest weights, the smallest first. Weights are averaged with themselves as shares: what is bright
-    /// for a short time, or on one side, counts by that.
+    /// Of the rows that can be judged, up to `most` with the smallest weights, the smallest first. A row's weight is its sum of squares over its sum, so
+    /// that Gaussians that are bright for a short time, or from one side, have large weights.
     pub fn smallest(&self, most: usize) -> Result<Vec<usize>> {
         let sums = to_vec(self.sums.clone(), "blending weights")?;
         let weight = |row: usize| sums[3 * row + 1] / sums[3 * row].max(f32::MIN_POSITIVE);
@@ -40,7 +40,8 @@ impl Weights {
         rows.truncate(most);
         Ok(rows)
     }
-    /// What the Gaussians of `plan` go on with; new ones with nothing. Only a `round` of this control leaves a share and counts: plans of others come at any time.
+    /// The sums of the Gaussians of `plan`; those of new ones are 0. Sums decay and rounds are counted only for a `round` of this control: the trainer makes
+    /// plans at any time.
     pub fn after(&self, plan: &DensityPlan, round: bool, device: &Device) -> Result<Self> {
         let (share, passed) = if round { (MEMORY, 1.0) } else { (1.0, 0.0) };
         let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
@@ -67,7 +68,7 @@ mod tests {
         weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0])).unwrap();
         assert!(weights.smallest(9).unwrap().is_empty(), "all are new");
         weights.rounds = vec![3.0; 4];
-        // The last one was never shown, so nobody can tell.
+        // The last one was never shown, so it is not judged.
         assert_eq!((weights.smallest(9).unwrap(), weights.smallest(1).unwrap()), (vec![2, 1, 0], vec![2]));
         let mut plan = DensityPlan::new();
         plan.keep(1);
@@ -75,7 +76,7 @@ mod tests {
         plan.keep(0);
         let mut after = weights.after(&plan, true, &device).unwrap();
         assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
-        // A plan of somebody else takes nothing from what is known.
+        // A plan of the trainer does not decay the sums.
         let other = weights.after(&plan, false, &device).unwrap();
         assert_eq!((other.rounds.as_slice(), other.smallest(9).unwrap()), (&[3.0, 0.0, 3.0][..], vec![0, 2]));
         assert_eq!(to_vec(other.sums, "sums").unwrap()[..3], to_vec(weights.sums.clone(), "sums").unwrap()[3..6]);

@@ -1,5 +1,5 @@
-//! `cdf` and `cdf-basis`: features of centres without stored tables (CC-4DGS, Section IV-B), and what becomes of them over time. `hash-basis`: the same as
-//! `cdf-basis` with features from a stored hash grid.
+//! `cdf` and `cdf-basis`: features of centres without stored tables (CC-4DGS, Section IV-B), and the offsets computed from them. `hash-basis`: as `cdf-basis`,
+//! with features from a stored hash grid.
 
 use super::grids::{HashGrid, cell, interpolate};
 use super::network::{chain, decoder, dot};

@@ -1,6 +1,6 @@
 //! `embedding` (E-D3DGS, Bae et al. 2024): a vector per Gaussian and one per time feed a coarse and a fine network, whose outputs are added.
 //!
-//! At the end of training, as a deformer is that was told of no progress: no head is faded, and the fine network sees all rows of the table of times.
+//! For progress 1, the default of a deformer: no head is faded, and the fine network sees all rows of the table of times.
 
 use super::grids::{cell, interpolate};
 use super::network::trunk_and_heads;

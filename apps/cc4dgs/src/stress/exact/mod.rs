@@ -1,7 +1,7 @@
 //! Deformers and loss terms in float64: their plain formulas, with the default settings but for those that [`FORMULAS`] names. Slow and obvious.
 //!
-//! Weights and attributes are read from a deformer by name, as float32; everything computed from them, from centres and from times is float64. Nothing is
-//! shared with the kernels but the hash signatures of vertices (integers, scaled) and the shapes of layers.
+//! Weights and attributes are read from a deformer by name, as float32; everything computed from them, from centres and from times is float64. Only the
+//! hash signatures of vertices (integers, scaled) and the shapes of layers are shared with the kernels.
 
 mod cdf;
 mod deform_mlp;

@@ -12,7 +12,7 @@ use serde::Serialize;
 
 /// Blobs the points lie in, so that neighbours share voxels as those of a body do.
 const BLOBS: usize = 12;
-/// A time at which every band of the encoding has a value.
+/// A time at which no band of the encoding is zero.
 const TIME: f32 = 0.43;
 
 #[derive(Serialize)]

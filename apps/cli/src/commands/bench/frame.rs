@@ -76,7 +76,7 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     }
     let stop = interrupt::stop_flag()?;
     for (done, case) in wanted.iter().enumerate() {
-        // What was measured so far is worth keeping.
+        // After an interruption the finished cases are reported.
         if done > 0 && stop.load(Ordering::Relaxed) {
             break;
         }

@@ -26,7 +26,7 @@ use std::time::Instant;
 /// Runs that are not counted: caches fill and kernels compile.
 const WARM_UP: usize = 2;
 
-/// Times of `repeats` runs of what ends with a read-back.
+/// Times of `repeats` calls of `run`, which must end with a read-back.
 pub fn timed(repeats: usize, mut run: impl FnMut() -> Result<()>) -> Result<Spread> {
     let mut times = Vec::with_capacity(repeats);
     for round in 0..WARM_UP + repeats {
@@ -48,7 +48,7 @@ pub fn scene_cases(names: &[String], share: f64) -> Result<Vec<SceneCase>> {
     Ok(SCENE_CASES.iter().filter(wanted).map(|case| shrunk(case, share)).collect())
 }
 
-/// Middle and spread of some times.
+/// Median and spread of some times.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Spread {
     /// The middle one, or the mean of the two in the middle.

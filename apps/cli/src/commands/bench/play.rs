@@ -1,4 +1,4 @@
-//! Playback of a trained model, as long as it takes to know its pace.
+//! Times playback of a trained model over a number of frames.
 
 use super::{Playback, time_playback};
 use crate::args::BenchPlay;

@@ -14,13 +14,13 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Between two looks at the processes.
+/// Interval at which the processes are checked.
 const TICK: Duration = Duration::from_millis(100);
-/// Before a training that another process works on is tried again.
+/// Wait before a training on which another process works is tried again.
 const BUSY_PAUSE: Duration = Duration::from_secs(1);
-/// A process that was asked to stop is ended after this.
+/// Time after which a process that was asked to stop is killed.
 const GRACE: Duration = Duration::from_secs(120);
-/// Most failed trainings that the error names.
+/// Upper bound on the failed trainings that the error names.
 const NAMED: usize = 8;
 
 /// A process at work.
@@ -28,7 +28,7 @@ struct Job {
     index: usize,
     child: Child,
     began: Instant,
-    /// Bytes that its log had before: what earlier processes said.
+    /// Length of its log when it started; the bytes before are of earlier processes.
     log_start: u64,
 }
 
@@ -39,7 +39,7 @@ struct PoolReport {
     seconds: f64,
 }
 
-/// How far the pool is.
+/// The state of the pool.
 struct Pool<'a> {
     context: &'a Context<'a>,
     plan: &'a Plan,
@@ -73,7 +73,7 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     let mut pool = Pool { context, plan, folder, threads, processes, events: &events, queue, running, seconds, failed, done, not_before };
     pool.progress();
     if let Err(error) = pool.work(jobs, stop) {
-        // Nobody else would end them: they are in groups of their own.
+        // They are in process groups of their own: only the pool ends them.
         pool.stop();
         return Err(error);
     }
@@ -168,7 +168,7 @@ impl Pool<'_> {
     fn ended(&mut self, job: &Job, status: ExitStatus, jobs: usize) -> Result<()> {
         let (training, complete) = (&self.plan.trainings[job.index], self.complete(job.index));
         match status.code() {
-            // Another process did it, so its time says nothing here.
+            // Another process did the training, so the time of this one is no time of a training.
             Some(code) if complete && code == i32::from(BUSY) => {}
             // A hopeless training has results too.
             _ if complete => {
@@ -255,7 +255,7 @@ fn why(code: Option<i32>, signal: Option<i32>, recorded: Option<Failure>, log: &
     }
 }
 
-/// What a process said at its end: the place and the message of a panic, else its last line.
+/// The last message of a process: location and message of a panic, else its last line.
 fn last_words(log: &[u8]) -> String {
     let text = String::from_utf8_lossy(log);
     let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();

@@ -112,7 +112,7 @@ impl Step {
     }
 }
 
-/// What the first tile starts with.
+/// The initial contents of the first tile.
 #[derive(Clone, Copy)]
 pub enum Input<'a> {
     /// Rows `[_, in]`.
@@ -213,7 +213,7 @@ impl Program {
             Input::Rows(x, _) => (x.clone(), None, 2),
             Input::Signatures(vertices, hash) => {
                 plan.extend(hash.constants());
-                // What is not read still needs a binding of its kind.
+                // `x` is not read, but the kernel needs a binding of its type.
                 (weights.clone(), Some(vertices.clone()), hash.modulus())
             }
         };

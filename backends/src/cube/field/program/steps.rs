@@ -241,7 +241,7 @@ fn position(index: usize, width: usize, first: usize, count: usize, #[comptime] 
     (r * comptime!(layout.stride) + i, index < comptime!(layout.tile) * width && first + r < count)
 }
 
-/// Columns of rows of `buffer` into a tile, the first of them `row`: what is given, or what was saved.
+/// Loads columns of rows of `buffer`, from row `row` on, into a tile. `buffer` holds given or saved values.
 #[cube]
 fn load(tiles: &mut Shared<[f32]>, buffer: &[f32], plan: &[u32], at: usize, row: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
@@ -269,7 +269,8 @@ fn load(tiles: &mut Shared<[f32]>, buffer: &[f32], plan: &[u32], at: usize, row:
     }
 }
 
-/// A thread saves here what it reads in [`mask`] and, for a reload, in [`load`], so that no other thread's writes have to arrive; what else they read is not used.
+/// Writes a tile to the output buffer. Each thread writes exactly the values that it reads back in [`mask`] and, for a reload, in [`load`]: no barrier for
+/// global memory is needed. Values that a thread reads there and did not write are not used.
 #[cube]
 fn save(tiles: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));

@@ -67,11 +67,11 @@ impl Suite<'_> {
     fn context(&self) -> DeformerContext {
         DeformerContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: 20, sh_degree: 2, seed: Seed::root(11).child("conformance") }
     }
-    /// A deformer as a stored model has it before its weights are replaced.
+    /// A deformer as it is built for a stored model, before its weights are replaced.
     fn opened(&self, device: &Device) -> Result<Built> {
         (self.plugin.build)(self.settings, &self.context(), device)
     }
-    /// A deformer as a training begins with it, from `count` Gaussians.
+    /// A deformer at the start of a training, from `count` Gaussians.
     fn started(&self, count: usize, device: &Device) -> Result<Built> {
         let mut built = self.opened(device)?;
         start_deformer(self.plugin.info.name, built.as_mut(), &self.first(count))?;

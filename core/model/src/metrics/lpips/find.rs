@@ -5,12 +5,12 @@ use cc4dgs_format::installed::{program_folder, user_data_folder, variable_path};
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 
-/// Names a weights file; nothing else is looked at then.
+/// Variable that names a weights file; if it is set, no other path is searched.
 pub const LPIPS_VARIABLE: &str = "CC4DGS_LPIPS";
 /// Name of the weights file where the variable does not state one.
 pub const LPIPS_FILE: &str = "lpips-alexnet.safetensors";
 
-/// The weights of this program, and where they are from.
+/// The weights that this program uses, and their source.
 #[derive(Clone, Debug)]
 pub struct InstalledLpips {
     /// The network.
@@ -19,7 +19,7 @@ pub struct InstalledLpips {
     pub source: String,
 }
 
-/// The files that [`installed_lpips`] looks at, in order: the one that the variable `CC4DGS_LPIPS` names, or else `lpips-alexnet.safetensors` in the
+/// The files that [`installed_lpips`] searches, in order: the one that the variable `CC4DGS_LPIPS` names, or else `lpips-alexnet.safetensors` in the
 /// user's data folder ([`user_data_folder`]) and in the folder of the program.
 pub fn lpips_paths() -> Vec<PathBuf> {
     if let Some(file) = variable_path(LPIPS_VARIABLE) {

@@ -215,7 +215,7 @@ impl FrameBench<'_> {
             switch("transmittance early out", |w| w.early_outs[1] = false, &fixed),
         ]
     }
-    /// Whether the deformer `name` decodes vertices that several Gaussians share. A playback layer in its place is no plug-in and has none.
+    /// Whether the deformer `name` decodes vertices that several Gaussians share. A playback layer instead of a deformer is no plug-in and decodes none.
     fn shares_vertices(&self, name: &str) -> bool {
         self.context.registry.deformer(name).is_ok_and(|plugin| plugin.info.capabilities.contains(&SHARES_VERTICES))
     }
@@ -233,7 +233,7 @@ impl FrameBench<'_> {
         let moment = |frame: usize| &self.moments[frame % self.moments.len()];
         let (camera, time_norm) = moment(turn.start);
         if turn.start == 0 {
-            // Kernels compile. The features are thrown away with the player, so that the first frame computes them.
+            // Compiles the kernels. The features are dropped with the player, so that the first frame computes them.
             self.player(model, case)?.render(camera, *time_norm)?;
         }
         let memory = PeakMemory::begin();
