@@ -174,7 +174,7 @@ def out_of_memory(pages):
     page.evaluate(NO_IMAGE)
     page.evaluate("window.device = cc4dgs.gpu; cc4dgs.set('resolution', 0.5)")
     page.wait_for_function(f"({ALERT}).includes('cannot draw an image of')")
-    assert page.evaluate("device.__wbg_ptr") == 0, "a player that has stopped keeps its model"
+    assert page.evaluate("[device.__wbg_ptr, cc4dgs.gl.capacity + Object.keys(cc4dgs.gl.textures).length]") == [0, 0], "a player that has stopped keeps its model"
     page.close()
     # The page writes what stops it to the console.
     pages.complaints[:] = [c for c in pages.complaints if "cannot draw" not in c]

@@ -295,7 +295,10 @@ class Page {
         try { this.advance(now); } catch (e) {
             // Nothing that would draw can be relied on any more. After a panic nothing of it can be called.
             console.error(e);
-            if (!(e instanceof WebAssembly.RuntimeError)) dispose(this.gpu);
+            if (!(e instanceof WebAssembly.RuntimeError)) {
+                this.gl?.free();
+                dispose(this.gpu);
+            }
             this.gpu = null;
             this.fail(new Error(`The player has stopped (${e.message}). Reload the page.`));
             return;

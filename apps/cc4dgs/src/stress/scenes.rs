@@ -18,8 +18,8 @@ const COUNT: usize = 60;
 /// Gaussians of equal depth.
 const MANY: usize = 3000;
 
-/// Conditions and levels that are ordinary: every device must draw them. Of conditions with several levels those that float32 can represent, such as the first
-/// decade; of moved scenes those at which float32 coordinates are finer than a hundredth of a pixel.
+/// Conditions and levels that are ordinary: every device must draw them. Of conditions with several levels the mild ones, such as the first decade; of moved
+/// scenes those at which float32 coordinates are finer than a hundredth of a pixel.
 const ORDINARY: [(&str, &str); 15] = [
     ("an ordinary scene", "-"),
     ("coordinates far from the origin", "1e2"),

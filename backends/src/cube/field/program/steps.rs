@@ -269,8 +269,8 @@ fn load(tiles: &mut Shared<[f32]>, buffer: &[f32], plan: &[u32], at: usize, row:
     }
 }
 
-/// Writes a tile to the output buffer. Each thread writes exactly the values that it reads back in [`mask`] and, for a reload, in [`load`]: no barrier for
-/// global memory is needed. Values that a thread reads there and did not write are not used.
+/// Writes a tile to the output buffer. Each thread writes the values that it uses when it reads them back in [`mask`] and, for a reload, in [`load`]: no
+/// barrier for global memory is needed. It also reads values that it did not write, which it does not use.
 #[cube]
 fn save(tiles: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
