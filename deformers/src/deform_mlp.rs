@@ -1,7 +1,7 @@
 //! The deformer of Deformable-3DGS: a network of eight layers on positionally encoded centre and time (Yang et al. 2024).
 //!
-//! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code. The last layers start at zero, so that
-//! nothing moves at first; the published ones are random.
+//! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code, whose rasterizer does not normalise the
+//! sum; ours does. The last layers start at zero, so that nothing moves at first; the published ones are random.
 
 use crate::parts::centres::{check_time, finite};
 use crate::parts::settings::{bounded, not_negative, within};

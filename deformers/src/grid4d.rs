@@ -2,8 +2,8 @@
 //!
 //! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised
 //! by the deformer's box rather than by a fixed bound per dataset, and so are the perturbations of the smoothness term. R(q) passes no gradient to the canonical
-//! centre. The published term starts after densification on N3DV and also perturbs times on most D-NeRF scenes; here it acts from the first iteration of the main
-//! stage, and times are not perturbed. The last layers start at zero, so that nothing moves at first; the published ones are random.
+//! centre. The published term begins when Gaussians no longer grow on N3DV, for which there is `smooth_from`. It also perturbs times on most D-NeRF scenes, which
+//! is omitted. The last layers start at zero, so that nothing moves at first; the published ones are random.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
 use crate::parts::settings::{bounded, not_negative, within};
@@ -33,6 +33,7 @@ width = 256
 depth = 0                # hidden layers after the attention
 smooth_weight = 0.5      # weight of the squared difference of features at perturbed centres
 smooth_delta = 1e-3      # the largest perturbation per axis, as a share of the box (published: 8e-5 on N3DV, 3e-3 on D-NeRF)
+smooth_from = 0.0        # share of the main stage after which smoothness counts (published: 0.706 on N3DV, where Gaussians grow until then)
 lr_grid_start = 8e-3     # Adam on the tables
 lr_grid_end = 8e-5
 lr_start = 8e-4          # Adam on the network
@@ -67,6 +68,7 @@ struct Settings {
     depth: usize,
     smooth_weight: f32,
     smooth_delta: f32,
+    smooth_from: f32,
     lr_grid_start: f64,
     lr_grid_end: f64,
     lr_start: f64,
@@ -88,6 +90,7 @@ impl Default for Settings {
             depth: 0,
             smooth_weight: 0.5,
             smooth_delta: 1e-3,
+            smooth_from: 0.0,
             lr_grid_start: 8e-3,
             lr_grid_end: 8e-5,
             lr_start: 8e-4,
@@ -117,6 +120,8 @@ struct Grid4d {
     temporal: Arc<ReluShape>,
     network: Arc<ReluShape>,
     parameters: Vec<Parameter>,
+    /// Progress of the main stage, 0..1.
+    progress: f32,
 }
 
 impl Grid4d {
@@ -134,7 +139,7 @@ impl Grid4d {
             within(name, base as usize, 2, last.max(2) as usize)?;
             within(name, last as usize, 2, 65_536)?;
         }
-        for (name, value, most) in [("smooth_weight", s.smooth_weight, 1e6), ("smooth_delta", s.smooth_delta, 1.0)] {
+        for (name, value, most) in [("smooth_weight", s.smooth_weight, 1e6), ("smooth_delta", s.smooth_delta, 1.0), ("smooth_from", s.smooth_from, 1.0)] {
             if !(0.0..=most).contains(&value) {
                 return Err(Error::parameter(format!("deformer.{name}"), format!("{value} is not in 0..{most}"), "Choose a value in this range"));
             }
@@ -167,7 +172,7 @@ impl Grid4d {
             parameters.push(parameter(format!("net.{name}"), Part::Net, NET, values, device));
         }
         let (space, time, attention, temporal, network) = (Arc::new(space), Arc::new(time), Arc::new(attention), Arc::new(temporal), Arc::new(network));
-        Ok(Self { context: context.clone(), space, time, attention, temporal, network, parameters, settings })
+        Ok(Self { context: context.clone(), space, time, attention, temporal, network, parameters, settings, progress: 1.0 })
     }
     fn weight(&self, index: usize) -> Tensor<1> {
         self.parameters[index].value.clone()
@@ -246,11 +251,11 @@ impl Deformer for Grid4d {
         vec![ParameterGroup::plain("grid4d net", s.lr_start, s.lr_end), ParameterGroup::plain("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
     }
     /// Smoothness: squared differences of features at centres and at slightly perturbed centres, both at `time_norm`, summed over channels and averaged over
-    /// centres.
+    /// centres. None before the share `smooth_from` of the main stage; a trained deformer that is trained further has it.
     fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let m = input.len();
-        if m == 0 || s.smooth_weight <= 0.0 {
+        if m == 0 || s.smooth_weight <= 0.0 || self.progress < s.smooth_from {
             return Ok(None);
         }
         let mut random = self.context.seed.child("perturb").index(u64::from(progress.to_bits())).rng();
@@ -260,6 +265,9 @@ impl Deformer for Grid4d {
         let squares = |a: Tensor<2>, b: Tensor<2>| ordered_sum((a - b).powi_scalar(2)).mul_scalar(s.smooth_weight / m as f32);
         let still = squares(lookup(self.weight(0), here.clone(), &self.space)?, lookup(self.weight(0), there.clone(), &self.space)?);
         Ok(Some(still + squares(self.with_time(&here, time_norm)?, self.with_time(&there, time_norm)?)))
+    }
+    fn set_progress(&mut self, progress: f32) {
+        self.progress = progress;
     }
 }
 
@@ -297,6 +305,24 @@ mod tests {
             assert!(build(smooth_delta, smooth_weight).is_err(), "{smooth_delta}, {smooth_weight}");
         }
         assert!(build(0.0, 0.0).is_ok() && build(5e-3, 0.5).is_ok());
+    }
+
+    #[test]
+    fn smoothness_begins_at_its_share_of_the_main_stage() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let small = Settings { log2_rows: 4, space_levels: 1, time_levels: 1, width: 4, smooth_from: 0.7, ..Settings::default() };
+        let mut deformer = Grid4d::new(small, &context, &Device::flex()).unwrap();
+        let input = SpatialInput::new(Tensor::from_floats([[0.3, -0.2, 0.1]], &Device::flex()));
+        let counts = |deformer: &Grid4d, progress: f32| deformer.regularizer(&input, 0.5, progress).unwrap().is_some();
+        assert!(counts(&deformer, 0.5), "a trained deformer that is trained further is smoothed");
+        for (progress, wanted) in [(0.001, false), (0.69, false), (0.71, true), (1.0, true)] {
+            deformer.set_progress(progress);
+            assert_eq!(counts(&deformer, progress), wanted, "at {progress}");
+        }
+        for smooth_from in [-0.1, 1.1, f32::NAN] {
+            let error = Grid4d::new(Settings { smooth_from, ..Settings::default() }, &context, &Device::flex()).err().map(|e| e.to_string());
+            assert!(error.is_some_and(|e| e.contains("smooth_from")), "{smooth_from}");
+        }
     }
 
     #[test]

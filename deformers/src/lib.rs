@@ -68,7 +68,7 @@ mod tests {
             ("cdf-basis", "lr_start lr_end clip_norm sparsity"),
             ("hash-basis", "lr_start lr_end clip_norm sparsity grid_rate"),
             ("hexplane", "lr_start lr_end grid_rate tv_space tv_time time_one"),
-            ("grid4d", "lr_start lr_end lr_grid_start lr_grid_end smooth_weight smooth_delta"),
+            ("grid4d", "lr_start lr_end lr_grid_start lr_grid_end smooth_weight smooth_delta smooth_from"),
             ("swift4d-hash", "lr_start lr_end grid_rate"),
             ("embedding", "lr_start lr_end gaussian_lr smooth_weight smooth_falloff"),
             ("deform-mlp", "lr_start lr_end"),

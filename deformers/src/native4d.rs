@@ -16,10 +16,10 @@ use serde::Deserialize;
 use std::f32::consts::TAU;
 
 const SCHEMA: &str = "\
-duration = 0.1414        # standard deviation in time of a new Gaussian, as a share of the sequence (published: sqrt(2) of 10 s)
+duration = 0.1414        # standard deviation in time of a new Gaussian, as a share of the sequence (published: sqrt(2) of 10 s on N3DV; sqrt(s / 5) of s seconds)
 hidden_below = 0.05      # a Gaussian whose opacity factor is below this is hidden
 harmonics = 2            # number of cosines of time by which colours change (4D spherical harmonics); 0 for constant colours
-time_lr = 1.6e-5         # Adam on the centre in time, times the extent of the cameras in the normalised frame (published: 1.6e-4 of seconds, 10 s)
+time_lr = 1.6e-5         # Adam on the centre in time, times the extent of the cameras in the normalised frame (published: 1.6e-4 of seconds; 10 s on N3DV)
 duration_lr = 5e-3       # Adam on the logarithm of the duration
 velocity_lr = 1e-3       # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
 color_lr = 1.25e-4       # Adam on the cosines' coefficients

@@ -105,7 +105,7 @@ mod tests {
 
     #[test]
     fn opacities_are_reset_and_gaussians_grow_at_published_iterations() {
-        let rows = [("hexplane", 10_000), ("native-4d", 15_000), ("deform-mlp", 12_000), ("grid4d", 12_000)];
+        let rows = [("hexplane", 15_000), ("native-4d", 15_000), ("deform-mlp", 12_000), ("grid4d", 12_000)];
         for (method, last) in rows {
             let config = RunConfig::resolve(Some(&format!("dnerf+{method}")), None, &[]).unwrap();
             let [coarse, _, main] = config.train.shares;
@@ -118,5 +118,66 @@ mod tests {
         }
         let config = RunConfig::resolve(Some("n3dv+hexplane"), None, &[]).unwrap();
         assert_eq!(Schedule::main(14_000).at(config.density["until"].as_integer().unwrap() as usize), 10_000);
+        // 15,000 of 20,000 iterations, of which the coarse stage has 3,000.
+        let config = RunConfig::resolve(Some("n3dv+grid4d"), None, &[]).unwrap();
+        assert_eq!((config.train.iterations, config.train.shares), (20_000, [3.0, 0.0, 17.0]));
+        let schedule = Schedule { total: 20_000, ..Schedule::main(17_000) };
+        let reference = |key: &str| config.density[key].as_integer().unwrap() as usize;
+        assert_eq!((schedule.at(reference("until")), schedule.at(reference("reset_main_every"))), (12_000, 6000));
+        assert_eq!((schedule.interval(reference("every"), 25), reference("reset_every")), (400, 0));
+        assert!((config.deformer["smooth_from"].as_float().unwrap() * 17_000.0 - 12_000.0).abs() < 10.0, "when Gaussians no longer grow");
+    }
+
+    #[test]
+    fn rounds_and_degrees_of_colours_have_published_intervals() {
+        let of_dnerf = ["hexplane", "native-4d", "deform-mlp", "grid4d"].map(|method| ("dnerf", method, 100));
+        let of_n3dv = ["hexplane", "native-4d", "embedding", "swift4d"].map(|method| ("n3dv", method, 100));
+        for (family, method, every) in of_dnerf.into_iter().chain(of_n3dv).chain([("n3dv", "grid4d", 400)]) {
+            let config = RunConfig::resolve(Some(&format!("{family}+{method}")), None, &[]).unwrap();
+            // Intervals shrink in runs of less than 28,000 iterations.
+            let schedule = Schedule { total: config.train.iterations, ..Schedule::main(1) };
+            let stated = config.density.get("every").map_or(100, |value| value.as_integer().unwrap() as usize);
+            assert_eq!((schedule.interval(stated, 25), schedule.interval(config.train.sh_interval, 100)), (every, 1000), "{family}+{method}");
+        }
+    }
+
+    #[test]
+    fn rates_begin_and_end_where_published_ones_are_after_as_many_iterations() {
+        let after = |first: f64, last: f64, share: f64| first * (last / first).powf(share);
+        let near = |found: f64, wanted: f64| assert!((found / wanted - 1.0).abs() < 5e-3, "{found} is not {wanted}");
+        let rate = |config: &RunConfig, key: &str| config.deformer[key].as_float().unwrap();
+        // Rates fall over 20,000 iterations: 3,000 of the coarse stage, and anew 14,000 of the main stage, on D-NeRF 20,000.
+        let hexplane = RunConfig::resolve(Some("n3dv+hexplane"), None, &[]).unwrap();
+        near(rate(&hexplane, "lr_end"), after(1.6e-4, 1.6e-5, 0.7));
+        near(hexplane.train.lr.means_end, after(1.6e-4, 1.6e-6, 0.7));
+        for config in [&hexplane, &RunConfig::resolve(Some("dnerf+hexplane"), None, &[]).unwrap()] {
+            near(after(config.train.lr.means, config.train.lr.means_end, config.train.lr.coarse_decay), after(1.6e-4, 1.6e-6, 0.15));
+        }
+        // Rates of the deformer fall over 45,000 iterations, those of centres over 35,000: the main stage has 3,001 to 20,000.
+        let grid4d = RunConfig::resolve(Some("n3dv+grid4d"), None, &[]).unwrap();
+        for (start, end, first, last) in [("lr_start", "lr_end", 1.6e-4, 1.6e-6), ("lr_grid_start", "lr_grid_end", 8e-3, 8e-5)] {
+            near(rate(&grid4d, start), after(first, last, 3.0 / 45.0));
+            near(rate(&grid4d, end), after(first, last, 20.0 / 45.0));
+        }
+        // On D-NeRF the deformers begin to learn after 3,000 iterations, too.
+        let [of_grid4d, of_mlp] = ["grid4d", "deform-mlp"].map(|method| RunConfig::resolve(Some(&format!("dnerf+{method}")), None, &[]).unwrap());
+        near(rate(&of_grid4d, "lr_start"), after(8e-4, 1.6e-6, 3.0 / 45.0));
+        near(rate(&of_grid4d, "lr_grid_start"), after(8e-3, 8e-5, 3.0 / 45.0));
+        near(rate(&of_mlp, "lr_start"), after(8e-4, 1.6e-6, 3.0 / 40.0));
+        near(grid4d.train.lr.means_end, after(1.6e-4, 1.6e-6, 20.0 / 35.0));
+        near(after(grid4d.train.lr.means, grid4d.train.lr.means_end, grid4d.train.lr.coarse_decay), after(1.6e-4, 1.6e-6, 3.0 / 35.0));
+    }
+
+    #[test]
+    fn times_of_native_4d_are_shares_of_published_seconds() {
+        for (family, seconds) in [("n3dv", 10.0f64), ("dnerf", 1.0), ("technicolor", 50.0)] {
+            let config = RunConfig::resolve(Some(&format!("{family}+native-4d")), None, &[]).unwrap();
+            // Where none is stated, the defaults of the deformer hold.
+            let of = |key: &str, default: f64| config.deformer.get(key).map_or(default, |value| value.as_float().unwrap());
+            let (duration, rate) = (of("duration", 0.1414) * seconds, of("time_lr", 1.6e-5) * seconds);
+            assert!((duration / (seconds / 5.0).sqrt() - 1.0).abs() < 1e-3 && (rate / 1.6e-4 - 1.0).abs() < 1e-9, "{family}: {duration} s, {rate}");
+            assert_eq!(config.render.background, Some([0.0; 3]), "{family}");
+            assert_eq!(config.density["max_scale_share"].as_float(), Some(0.1), "{family}");
+        }
     }
 }
