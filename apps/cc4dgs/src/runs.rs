@@ -3,7 +3,7 @@
 use cc4dgs_core::{Error, Result};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 pub use cc4dgs_train::event_log::EVENTS;
-use cc4dgs_train::train::CONFIG;
+use cc4dgs_train::train::{CONFIG, check_unused};
 use std::path::Path;
 
 /// What to do where the folder holds a run already.
@@ -18,8 +18,8 @@ pub enum Existing {
     Overwrite,
 }
 
-/// Refuses a folder with a run unless it may be overwritten, a folder without a checkpoint if a run is to be resumed, a file, and a folder that cannot be
-/// written. `remedy` says what to do instead. Nothing is created.
+/// Refuses a folder with a run unless it may be overwritten, a folder without a checkpoint if a run is to be resumed, one that a training writes into, a file, and a
+/// folder that cannot be written. `remedy` says what to do instead. Nothing is created.
 ///
 /// # Errors
 /// [`Error::Parameter`] that names the folder and what is found there; [`Error::Io`] for a folder that cannot be written.
@@ -34,12 +34,16 @@ pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<(
         (Existing::Refuse, Some(name)) => refuse(format!("it holds a run already ({name})")),
         // The checkpoint is what is looked for first.
         (Existing::Resume, found) if found != Some(CHECKPOINT) => refuse("nothing to resume, it has no checkpoint".into()),
-        _ => check_writable(folder),
+        // Before the log of the run is opened.
+        _ => check_unused(folder).and_then(|()| check_writable(folder)),
     }
 }
 
-/// Creates a file without a name in the nearest folder that exists, to test that it can be written.
-fn check_writable(folder: &Path) -> Result<()> {
+/// Refuses a `folder` that cannot be written: a file without a name is created in the nearest one that exists, `folder` itself or one of those around it.
+///
+/// # Errors
+/// [`Error::Io`] that names the folder that exists.
+pub fn check_writable(folder: &Path) -> Result<()> {
     let there = folder.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
     tempfile::tempfile_in(there).map(drop).map_err(|e| Error::io(there, e))
 }

@@ -10,17 +10,22 @@ const SAME_REQUEST: Duration = Duration::from_secs(1);
 static STOP: AtomicBool = AtomicBool::new(false);
 static INSTALLED: OnceLock<Result<(), String>> = OnceLock::new();
 
-/// Installs the handler (once per process) and returns the flag it sets.
+/// Installs the handler (once per process) and returns the flag it sets. Without it Ctrl-C ends the process, and ffmpeg where it decodes a video.
 pub fn stop_flag() -> Result<&'static AtomicBool> {
     let installed = INSTALLED.get_or_init(|| {
         let mut first = None;
-        ctrlc::set_handler(move || {
+        let set = ctrlc::set_handler(move || {
             STOP.store(true, Ordering::SeqCst);
             if first.get_or_insert_with(Instant::now).elapsed() > SAME_REQUEST {
+                cc4dgs_train::data::end_commands();
                 std::process::exit(130);
             }
         })
-        .map_err(|e| e.to_string())
+        .map_err(|e| e.to_string());
+        if set.is_ok() {
+            cc4dgs_train::data::answers_interrupts();
+        }
+        set
     });
     match installed {
         Ok(()) => Ok(&STOP),

@@ -20,7 +20,7 @@ impl Layers {
     /// name has no effect.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for unknown presets, text that is not TOML and keys of earlier versions; [`Error::Io`] for the file.
+    /// [`Error::Parameter`] for unknown presets, text that is not TOML, a preset among the overrides and keys of earlier versions; [`Error::Io`] for the file.
     pub fn collect(registry: &Registry, preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
         let mut from_file = match file {
             Some(path) => {
@@ -44,6 +44,7 @@ impl Layers {
     fn of(preset: toml::Table, file: toml::Table, sets: Vec<String>) -> Result<Self> {
         let mut table = preset;
         config::merge(&mut table, &file);
+        refuse_preset(&sets)?;
         config::set_all(&mut table, &sets)?;
         refuse_renamed(&table)?;
         Ok(Self { table, file, sets })
@@ -59,8 +60,9 @@ impl Layers {
     /// These layers with further overrides over them.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for text that is not `key=value`.
+    /// [`Error::Parameter`] for text that is not `key=value`, and for a preset.
     pub fn with(&self, sets: &[String]) -> Result<Self> {
+        refuse_preset(sets)?;
         let mut layers = self.clone();
         config::set_all(&mut layers.table, sets)?;
         layers.sets.extend_from_slice(sets);
@@ -117,6 +119,17 @@ fn not_finite(table: &toml::Table) -> Option<(String, f64)> {
     table.iter().find_map(|(key, value)| within(value).map(|(rest, v)| (if rest.is_empty() { key.clone() } else { format!("{key}.{rest}") }, v)))
 }
 
+/// Refuses a preset among overrides: it would give the run its name and none of its settings, and decide whether a plan is made.
+fn refuse_preset(sets: &[String]) -> Result<()> {
+    let name = |set: &String| set.split_once('=').filter(|(key, _)| key.trim() == "preset").map(|(_, name)| name.trim().to_string());
+    let Some(name) = sets.iter().find_map(name) else { return Ok(()) };
+    Err(Error::parameter(
+        "preset",
+        format!("{name} is set as an override, which cannot choose a preset"),
+        "State it as the preset: --preset, or preset in --config FILE",
+    ))
+}
+
 /// Keys of earlier versions and what replaces them.
 const RENAMED: [(&str, &str); 3] = [
     ("train.densify", "[density], such as density.max_gaussians"),
@@ -164,6 +177,19 @@ mod tests {
             let layers = Layers::collect(&registry, stated, Some(file.as_path()), &[]).unwrap();
             assert_eq!((layers.table()["preset"].as_str(), layers.want_plan()), (Some(name), plans), "{stated:?}");
             assert!(layers.state("train.batch"), "the file's settings hold");
+        }
+    }
+
+    #[test]
+    fn an_override_chooses_no_preset() {
+        let registry = Registry::collect().unwrap();
+        let auto = Layers::collect(&registry, Some("auto"), None, &[]).unwrap();
+        for set in ["preset=demo", " preset = 'auto' "] {
+            let sets = ["train.batch=3".to_string(), set.to_string()];
+            for refused in [Layers::collect(&registry, Some("auto"), None, &sets), auto.with(&sets)] {
+                let message = refused.unwrap_err().to_string();
+                assert!(message.starts_with("preset: ") && message.contains("--preset"), "{message}");
+            }
         }
     }
 

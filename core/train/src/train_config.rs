@@ -81,7 +81,8 @@ pub struct TrainConfig {
     pub mask_threshold: f32,
     /// Standard deviation in pixels of the Gaussian by which temporal deviations are blurred. Published masks have 5, for images 1,352 pixels wide.
     pub mask_sigma: f32,
-    /// At a third and at two thirds of the main stage, scored Gaussians that move by less than so many pixels in every training camera are made static; 0 is off.
+    /// At a third and at two thirds of the main stage, but not before `time_ramp`, scored Gaussians that move by less than so many pixels in every training camera are
+    /// made static; 0 is off.
     pub settle: f32,
     /// Where several cameras see each frame: every so many frames is a key frame, at which what moves starts with points and lives of its own; 0 is off.
     pub key_frames: usize,

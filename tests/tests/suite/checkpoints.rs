@@ -112,6 +112,52 @@ fn a_run_whose_images_are_lost_keeps_what_it_learned() {
     assert!(bytes("broken") == bytes("whole"));
 }
 
+/// Takes the images away after an event.
+struct LoseAfter<'a>(fn(&Event) -> bool, &'a AtomicBool);
+
+impl EventSink for LoseAfter<'_> {
+    fn emit(&self, event: &Event) {
+        if (self.0)(event) {
+            self.1.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+#[test]
+fn images_that_are_lost_before_or_after_a_step_cost_no_stage_that_is_done() {
+    type Case<'a> = (&'a str, fn(&Event) -> bool, &'a [&'a str]);
+    let main_begins: fn(&Event) -> bool = |event| matches!(event, Event::StageStarted { stage, .. } if stage == "main");
+    let score_ends: fn(&Event) -> bool = |event| matches!(event, Event::StageFinished { stage, .. } if stage == "score");
+    let seventh: fn(&Event) -> bool = |event| matches!(event, Event::Iteration { stage, iteration, .. } if stage == "main" && *iteration == 7);
+    let cases: [Case; 3] = [
+        ("in the first step", main_begins, &[]),
+        ("for key frames", score_ends, &["train.key_frames=4", "deformer.life=true", "train.dynamic=score"]),
+        // Each of the 20 iterations of the main stage is validated.
+        ("for validation", seventh, &["train.validation=2", "train.shares=[1,0,1]", "train.dynamic=all"]),
+    ];
+    let (registry, never) = (Registry::collect().unwrap(), AtomicBool::new(false));
+    for (case, loses, own) in cases {
+        let (folder, lost) = (tempfile::tempdir().unwrap(), Arc::new(AtomicBool::new(false)));
+        let sets = [&["train.iterations=40", "train.log_every=1", "density={kind='none'}"][..], own].concat();
+        let (config, scene) = fragile(&sets, &lost);
+        let scene = Arc::new(scene);
+        let train = |name: &str, resume: bool, events: &dyn EventSink| {
+            let (out, scene) = (Some(folder.path().join(name)), scene.clone());
+            train(&TrainJob { config: &config, scene, out, resume, registry: &registry, events, stop: &never, observer: None }).map(|(_, report)| report)
+        };
+        let bytes = |name: &str| std::fs::read(folder.path().join(name).join(CHECKPOINT)).unwrap();
+        train("whole", false, &Silent).unwrap();
+        let error = train("broken", false, &LoseAfter(loses, &lost)).unwrap_err();
+        assert!(error.to_string().contains("the disk is gone"), "{case}: {error}");
+        let heard = Recorder::default();
+        lost.store(false, Ordering::Relaxed);
+        train("broken", true, &heard).unwrap_or_else(|error| panic!("{case}: {error}"));
+        let iteration_of = |event: Event| if let Event::Iteration { stage, iteration, .. } = event { Some((stage, iteration)) } else { None };
+        assert_eq!(heard.events().into_iter().find_map(iteration_of), Some(("main".into(), 1)), "{case}");
+        assert!(bytes("broken") == bytes("whole"), "{case}");
+    }
+}
+
 #[test]
 fn first_points_that_are_not_finite_are_removed_where_the_main_stage_is_the_only_one() {
     let (registry, stop) = (Registry::collect().unwrap(), AtomicBool::new(false));

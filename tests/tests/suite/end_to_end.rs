@@ -165,6 +165,18 @@ fn key_frames_are_added_once_however_a_run_is_interrupted() {
 }
 
 #[test]
+fn what_key_frames_add_counts_before_a_warning_that_nothing_moves() {
+    // No score gets there; the Gaussians of key frames are given one.
+    let zeta = ["train.key_frames=4", "train.dynamic=score", "train.zeta=1e6", "train.iterations=12", "scene.width=96", "scene.height=96"];
+    let recorder = Recorder::default();
+    run(&tiny_of("demo+free-time", &zeta), tempfile::tempdir().unwrap().path(), false, &recorder, &AtomicBool::new(false)).unwrap();
+    let events = recorder.events();
+    let added = events.iter().position(|e| matches!(e, Event::Note { object, .. } if object == "key frames")).unwrap();
+    let warned = events.iter().position(|e| matches!(e, Event::Warning { object, message } if object == "deformer" && message.contains("train.zeta")));
+    assert!(warned.is_none_or(|warned| warned > added), "{events:?}");
+}
+
+#[test]
 fn a_training_that_is_refused_leaves_the_run_before() {
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);

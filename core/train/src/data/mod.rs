@@ -42,6 +42,7 @@ pub use hold_out::hold_out;
 pub(crate) use named_files::named_files;
 pub use resample::resize;
 pub use undistort::Undistort;
+pub use video::{answers_interrupts, end_commands};
 
 use cc4dgs_core::{Error, Limits, RawScene, ReaderPlugin, Registry, Result, Scene, SceneOptions, Similarity};
 use std::path::Path;

@@ -13,7 +13,7 @@ const SCORES: &str = "dynamic_scores";
 const LEAST_SHARE: f64 = 0.25;
 
 /// How many Gaussians key frames or recovery may add in any case, where there are `now`.
-pub(super) fn least_places(now: usize) -> usize {
+pub(super) fn least_added(now: usize) -> usize {
     (LEAST_SHARE * now as f64) as usize
 }
 
@@ -47,11 +47,11 @@ fn check_step(kind: &str, set: &GaussianSet, name: &str, values: &Tensor<2>) -> 
 }
 
 impl Context<'_> {
-    /// How many Gaussians key frames or recovery may add where there are `now`: as many as `density.max_gaussians` leaves, or [`least_places`] if that is more. `None`
+    /// How many Gaussians key frames or recovery may add where there are `now`: as many as `density.max_gaussians` leaves, or [`least_added`] if that is more. `None`
     /// for density controls without such a bound.
-    pub(super) fn places(&self, now: usize) -> Option<usize> {
+    pub(super) fn most_added(&self, now: usize) -> Option<usize> {
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer)?;
-        Some((most.max(0) as usize).saturating_sub(now).max(least_places(now)))
+        Some((most.max(0) as usize).saturating_sub(now).max(least_added(now)))
     }
 
     /// What the density control wants after an optimizer step: new values of all rows, then a plan for the rows themselves.

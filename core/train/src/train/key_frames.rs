@@ -1,6 +1,6 @@
 //! Gaussians of key frames: what moves starts with a life at each of them, so that nothing has to be followed from the first frame to the last.
 
-use super::density::least_places;
+use super::density::least_added;
 use super::parents::Parents;
 use super::recover::own_lives;
 use super::{Context, TrainState};
@@ -58,7 +58,7 @@ impl Context<'_> {
             }
         };
         let now = state.set.len();
-        let count = self.places(now).unwrap_or_else(|| least_places(now));
+        let count = self.most_added(now).unwrap_or_else(|| least_added(now));
         let points = frames.points(count, seed.child("motion"));
         let end = self.job.scene.views.iter().fold(0.0f32, |end, view| end.max(view.time_norm));
         let times = Times { keys: &frames.times, end: f64::from(end) };

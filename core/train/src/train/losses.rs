@@ -24,7 +24,7 @@ struct Listed {
 impl LossTerms {
     /// Builds the terms of the `[[loss]]` sections. Terms that a plug-in computes together are replaced by it.
     pub fn build(registry: &Registry, sections: &[toml::Table]) -> Result<Self> {
-        let mut listed = sections.iter().map(read).collect::<Result<Vec<_>>>()?;
+        let mut listed = sections.iter().map(|section| read("loss", section)).collect::<Result<Vec<_>>>()?;
         listed.retain(|term| term.weight != 0.0);
         if listed.is_empty() {
             return Err(Error::parameter("loss", "no term has a weight", "List at least one, such as [[loss]] kind = \"l1\", weight = 1.0"));
@@ -43,6 +43,15 @@ impl LossTerms {
             terms.push(Term { name: term.kind.clone(), weight: term.weight, term: built });
         }
         Ok(Self(terms))
+    }
+    /// Builds the term of the score stage from the `[score_loss]` section, which errors name.
+    pub fn build_score(registry: &Registry, section: &toml::Table) -> Result<Self> {
+        let Listed { kind, weight, .. } = read("score_loss", section)?;
+        if weight == 0.0 {
+            let remedy = "Give a number above 0, or leave the score stage out: train.dynamic = \"all\" or \"none\"";
+            return Err(Error::parameter(format!("score_loss {kind}: weight"), "0 leaves the score stage nothing to optimise", remedy));
+        }
+        Self::build(registry, std::slice::from_ref(section))
     }
     /// Whether a term compares recorded depth.
     pub fn want_depth(&self) -> bool {
@@ -118,16 +127,17 @@ pub(crate) fn single(object: &str, term: Tensor<1>) -> Result<Tensor<1>> {
     }
 }
 
-fn read(section: &toml::Table) -> Result<Listed> {
-    let (kind, mut settings) = split_kind("loss", section)?;
+/// Reads a section called `name`.
+fn read(name: &str, section: &toml::Table) -> Result<Listed> {
+    let (kind, mut settings) = split_kind(name, section)?;
     let weight = match settings.remove("weight") {
         None => 1.0,
         Some(toml::Value::Float(weight)) => weight,
         Some(toml::Value::Integer(weight)) => weight as f64,
-        Some(other) => return Err(Error::parameter(format!("loss {kind}: weight"), format!("{other} is not a number"), "Give a number of 0 or more")),
+        Some(other) => return Err(Error::parameter(format!("{name} {kind}: weight"), format!("{other} is not a number"), "Give a number of 0 or more")),
     };
     if !weight.is_finite() || weight < 0.0 {
-        return Err(Error::parameter(format!("loss {kind}: weight"), format!("{weight} cannot be used"), "Give a finite number of 0 or more"));
+        return Err(Error::parameter(format!("{name} {kind}: weight"), format!("{weight} cannot be used"), "Give a finite number of 0 or more"));
     }
     Ok(Listed { kind, weight, settings })
 }
@@ -202,6 +212,18 @@ mod tests {
         assert!(message.starts_with("loss far: it compares recorded depth, and no training view of flat has any, so that no term"), "{message}");
         let (object, message) = further(&beside, &flat).unwrap().unwrap();
         assert!(object == "loss far" && message.contains("no training view of flat has any") && message.contains("other terms"), "{object}: {message}");
+    }
+
+    #[test]
+    fn weights_that_cannot_be_used_are_named_with_their_section() {
+        let registry = Registry::collect().unwrap();
+        let section = |weight: &str| format!("kind = 'mask-bce'\nweight = {weight}").parse::<toml::Table>().unwrap();
+        for weight in ["0", "0.0", "-1.0", "'much'"] {
+            let message = LossTerms::build_score(&registry, &section(weight)).err().unwrap().to_string();
+            assert!(message.starts_with("score_loss mask-bce: weight: "), "{message}");
+        }
+        let message = LossTerms::build(&registry, &[section("-1.0")]).err().unwrap().to_string();
+        assert!(message.starts_with("loss mask-bce: weight: "), "{message}");
     }
 
     #[test]

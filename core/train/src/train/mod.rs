@@ -37,7 +37,7 @@ mod validate;
 mod watchdog;
 
 pub(crate) use cost::share_per_view;
-pub use folder::CONFIG;
+pub use folder::{CONFIG, check_unused};
 pub use guard::Guard;
 pub(crate) use losses::LossTerms;
 pub use observe::{Observer, Snapshot, Standing};
@@ -63,6 +63,7 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{AppearanceContext, Event, EventSink, PosesContext, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, parse_device};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::{Model, Moving};
+use folder::FolderLock;
 use moving::decide_moving;
 use pyramid::Pyramid;
 use serde::Serialize;
@@ -154,10 +155,11 @@ pub(crate) struct Context<'a> {
 /// Trains. With a folder, `config.toml` and `checkpoint` are written into it.
 ///
 /// # Errors
-/// [`Error::Parameter`] for settings out of range, before anything is written, and for going on without a folder, [`Error::Interrupted`] after `stop` was set
-/// (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with lower rates, [`Error::Data`] for a scene that
-/// cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own earlier scores (the checkpoint is
-/// kept), and whatever the scene, the plug-ins or the disk report. A checkpoint is written before the error of an image that cannot be read any more.
+/// [`Error::Parameter`] for settings out of range and for a folder that another training writes into, before anything is written, and for going on without a
+/// folder, [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with
+/// lower rates, [`Error::Data`] for a scene that cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far
+/// below its own earlier scores (the checkpoint is kept), and whatever the scene, the plug-ins or the disk report. A checkpoint is written before the error of an
+/// image that cannot be read any more.
 ///
 /// [`Error::Parameter`]: cc4dgs_core::Error::Parameter
 /// [`Error::Interrupted`]: cc4dgs_core::Error::Interrupted
@@ -176,6 +178,8 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         let problem = "there is no folder, and so no checkpoint to go on from";
         return Err(cc4dgs_core::Error::parameter("resume", problem, "Give the folder of the run, or begin a new one"));
     }
+    // Held until the end.
+    let mut lock = job.out.as_deref().map_or(Ok(None), FolderLock::take)?;
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
     let scene = hold_out(&job.scene, config.train.validation)?;
     let job = &TrainJob { config, scene: Arc::new(scene), out: job.out.clone(), ..*job };
@@ -221,15 +225,15 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let rasterizer = job.registry.build_rasterizer(&config.rasterizer)?;
     let losses = LossTerms::build(job.registry, &config.loss)?;
     losses.check_depth(&job.scene)?;
-    let score_loss = LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?;
+    let score_loss = LossTerms::build_score(job.registry, &config.score_loss)?;
     score_loss.refuse_depth()?;
     let mut state = match start {
         Start::Resumed(state) => *state,
         Start::New(parts) => {
             let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
             // What is refused until here leaves the run that was to be overwritten.
-            if !job.resume {
-                folder::write_config(job)?;
+            if let Some(out) = job.out.as_deref().filter(|_| !job.resume) {
+                folder::begin(out, config, &mut lock)?;
             }
             TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, state::longest_focal(&job.scene), parts)
         }
@@ -266,7 +270,8 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         let stage_began = Instant::now();
         // Where no camera stands still; the score stage leaves the geometry alone, so a resumed run finds the same masks.
         if stage == Stage::Score && matches!(moving, Moving::Scored { .. }) && context.masks.is_empty() && context.lengths.length(stage) > 0 {
-            context.masks = context.residual_masks(&mut state)?;
+            let masks = context.residual_masks(&mut state);
+            context.masks = context.saved_before_error(masks, &mut state)?;
         }
         context.run_stage(stage, &mut state, &mut watch)?;
         stage_seconds.insert(stage.name().to_string(), stage_began.elapsed().as_secs_f64());

@@ -1,6 +1,6 @@
 //! What a run remembers of its own numbers. It is kept in checkpoints, so that an interrupted run reports what an uninterrupted one does.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// Numbers of a run that outlive an interruption.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -61,20 +61,37 @@ impl LogRecord {
 pub(crate) struct Score {
     /// Share of the main stage, percent.
     pub percent: usize,
+    #[serde(deserialize_with = "number_or_null")]
     pub psnr_db: f64,
     pub moving_db: Option<f64>,
     /// Moving pixels in images of other times.
     pub frozen_db: Option<f64>,
     /// Mean slope over that of the truth.
+    #[serde(deserialize_with = "number_or_null")]
     pub detail: f64,
     /// PSNR between the blurred images and the blurred truth; absent in older checkpoints.
     #[serde(default)]
     pub blurred_db: Option<f64>,
 }
 
+/// A number; NaN for the `null` that JSON has in place of one that is not finite, such as the score of a model that the watchdog is about to take back.
+fn number_or_null<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::NAN))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn scores_that_are_not_finite_can_be_read_again() {
+        let score = Score { percent: 50, psnr_db: f64::NEG_INFINITY, moving_db: Some(f64::NAN), frozen_db: None, detail: f64::NAN, blurred_db: Some(20.0) };
+        let finite = Score { psnr_db: 30.5, detail: 0.75, moving_db: None, ..score };
+        let text = serde_json::to_string(&Record { scores: vec![score, finite], ..Record::default() }).unwrap();
+        let Record { scores, .. } = serde_json::from_str(&text).unwrap();
+        assert!(scores[0].psnr_db.is_nan() && scores[0].detail.is_nan() && scores[0].blurred_db == Some(20.0), "{scores:?}");
+        assert_eq!(scores[1], finite);
+    }
 
     #[test]
     fn attempts_come_back_and_are_absent_without_trouble() {

@@ -20,11 +20,11 @@ const LEAST_CHANGE: f32 = 0.03;
 const LEAST_DEPTH: f64 = 0.05;
 
 impl Context<'_> {
-    /// Makes Gaussians static that move by less than `train.settle` pixels in every training camera, when the iteration is due.
+    /// Makes Gaussians static that move by less than `train.settle` pixels in every training camera, when the iteration is due, and all frames are trained on.
     pub(crate) fn settle(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let most_px = self.job.config.train.settle;
         let Moving::Scored { zeta } = state.moving else { return Ok(()) };
-        if most_px <= 0.0 || schedule.stage != Stage::Main || !is_due(schedule) {
+        if most_px <= 0.0 || schedule.stage != Stage::Main || !is_due(schedule, self.job.config.train.time_ramp) {
             return Ok(());
         }
         let rows = state.moving_rows(&self.device)?;
@@ -79,9 +79,10 @@ impl Context<'_> {
     }
 }
 
-/// Whether it is looked at after this iteration of the main stage.
-fn is_due(schedule: &Schedule) -> bool {
-    SHARES.iter().any(|&share| schedule.iteration == schedule.iteration_at(share) as usize)
+/// Whether it is looked at after this iteration of the main stage: not before the share `time_ramp`, because what moves in frames that have not come in yet seems to
+/// stand still.
+fn is_due(schedule: &Schedule, time_ramp: f64) -> bool {
+    SHARES.iter().any(|&share| share > time_ramp && schedule.iteration == schedule.iteration_at(share) as usize)
 }
 
 /// Raises each of `most` to the value beside it.
@@ -106,16 +107,19 @@ mod tests {
     fn a_main_stage_is_looked_at_twice_whatever_its_length_becomes() {
         let due = |image_growth: f64, stretch: f64| -> Vec<usize> {
             let lengths = StageLengths::new(&TrainConfig { iterations: 2800, image_growth, stretch, ..Default::default() }, true, 1.0);
-            (1..=lengths.length(Stage::Main)).filter(|&iteration| is_due(&lengths.schedule(Stage::Main, iteration))).collect()
+            (1..=lengths.length(Stage::Main)).filter(|&iteration| is_due(&lengths.schedule(Stage::Main, iteration), 0.0)).collect()
         };
         assert_eq!(due(0.0, 1.0), [666, 1333]);
         // The length is settled after 400 iterations, in the second case after 1,200 of the 2,000 that were planned.
         assert_eq!(due(0.0, 4.0).len(), 2);
         assert_eq!((due(0.6, 2.0).len(), due(0.6, 2.0)[0]), (2, 666));
         for length in 3..3000 {
-            let thirds = (1..=length).filter(|&iteration| is_due(&Schedule { iteration, ..Schedule::main(length) }));
+            let thirds = (1..=length).filter(|&iteration| is_due(&Schedule { iteration, ..Schedule::main(length) }, 0.0));
             assert!(thirds.eq([length / 3, 2 * length / 3]), "{length}");
         }
+        // All frames are there after two fifths.
+        let due: Vec<usize> = (1..=900).filter(|&iteration| is_due(&Schedule { iteration, ..Schedule::main(900) }, 0.4)).collect();
+        assert_eq!(due, [600]);
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use super::log::Log;
 use super::pace::Pace;
+use super::record::LogRecord;
 use super::sampler::{Prefetcher, Sampler};
 use super::watchdog::Watchdog;
 use super::{Context, TrainState};
@@ -15,6 +16,11 @@ use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
+/// Whether `result` says that an image cannot be read.
+fn is_lost_image<T>(result: &Result<T>) -> bool {
+    matches!(result, Err(Error::Io { .. } | Error::Data { .. }))
+}
+
 impl Context<'_> {
     /// Runs `stage` from where `state` stands to its end.
     pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
@@ -22,6 +28,7 @@ impl Context<'_> {
         if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
             if stage == Stage::Main {
                 self.begin_main(state)?;
+                self.warn_of_stillness(state)?;
             }
             return Ok(());
         }
@@ -33,8 +40,12 @@ impl Context<'_> {
             state.begin_stage(&self.device);
             if stage == Stage::Main {
                 self.begin_main(state)?;
-                self.add_key_frames(state)?;
-                watch.before_main(self, state)?;
+                // Images are read before anything is added: a run from here adds all of them.
+                let added = self.add_key_frames(state);
+                self.saved_before_error(added, state)?;
+                self.warn_of_stillness(state)?;
+                let scored = watch.before_main(self, state);
+                self.saved_if_resumable(scored, state)?;
             }
         }
         let first = self.lengths.schedule(stage, state.iteration + 1);
@@ -47,6 +58,8 @@ impl Context<'_> {
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
         let mut log = Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
+        // That of the state that the watchdog remembers.
+        let mut log_of_good = log.record();
         while state.iteration < self.lengths.length(stage) {
             // A main stage that has begun and has no iteration would begin again, key frames included, when it is resumed.
             if (state.iteration > 0 || stage != Stage::Main) && self.job.stop.load(Ordering::Relaxed) {
@@ -77,18 +90,14 @@ impl Context<'_> {
                 Stage::Score => self.score_step(state, &schedule, check, &mut log),
                 _ => self.photometric_step(&schedule, state, &batch, check, &mut log),
             };
-            if matches!(&stepped, Err(Error::Io { .. } | Error::Data { .. })) {
-                // An image cannot be read: nothing was learned from this iteration.
+            if is_lost_image(&stepped) {
+                // Nothing was learned from this iteration.
                 state.record.log = log_before;
-                self.save_before_error(state);
             }
-            let trouble = stepped?;
+            let trouble = self.saved_if_resumable(stepped, state)?;
             if trouble.is_none() {
-                if stage != Stage::Score {
-                    self.control_density(&schedule, state)?;
-                }
-                self.settle(state, &schedule)?;
-                self.recover(state, &schedule)?;
+                let changed = self.change_gaussians(state, &schedule);
+                self.good_saved_before_error(changed, &watchdog, log_of_good, state)?;
             }
             state.iteration = schedule.iteration;
             watchdog.after_iteration(self, state, trouble, length, saves)?;
@@ -103,13 +112,18 @@ impl Context<'_> {
                 }
                 factor.map_or(Ok(()), |factor| self.stretch_main(factor))?;
             }
-            if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
+            let watched = watch.after_iteration(self, state, &schedule);
+            if let Some(failure) = self.good_saved_before_error(watched, &watchdog, log_of_good, state)? {
                 state.record.log = log.record();
                 self.save(state)?;
                 return Err(failure);
             }
-            self.validate(state, &schedule)?;
+            let validated = self.validate(state, &schedule);
+            self.good_saved_before_error(validated, &watchdog, log_of_good, state)?;
             self.observe(state, &schedule, batch.len())?;
+            if watchdog.remember(state, length) {
+                log_of_good = log.record();
+            }
             if saves {
                 state.record.log = log.record();
                 self.save(state)?;
@@ -128,6 +142,15 @@ impl Context<'_> {
             events.emit(&Event::Work { stage: "score".into(), counter: "Gaussians that move".into(), done: moving, skipped: all - moving });
         }
         Ok(())
+    }
+
+    /// What follows the optimizer step of an iteration and changes which Gaussians there are, and which of them may move.
+    fn change_gaussians(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        if schedule.stage != Stage::Score {
+            self.control_density(schedule, state)?;
+        }
+        self.settle(state, schedule)?;
+        self.recover(state, schedule)
     }
 
     /// Which views the iterations of the stage of `schedule` see.
@@ -173,12 +196,17 @@ impl Context<'_> {
     fn begin_main(&self, state: &mut TrainState) -> Result<()> {
         let deformer = self.new_deformer(state, self.job.config.deformer.clone())?;
         state.set.add_attributes(&deformer.field.attributes(), self.seed.child("attributes"))?;
-        let moves = !deformer.field.is_static() && state.moving_rows(&self.device)?.count() > 0;
-        if !moves && !deformer.field.is_static() && state.moving != Moving::Nothing {
+        state.deformer = Some(deformer);
+        Ok(())
+    }
+
+    /// Warns where no Gaussian has a score to move, once key frames have added theirs.
+    fn warn_of_stillness(&self, state: &mut TrainState) -> Result<()> {
+        let may_move = state.moving != Moving::Nothing && state.deformer.as_ref().is_some_and(|deformer| !deformer.field.is_static());
+        if may_move && state.moving_rows(&self.device)?.count() == 0 {
             let message = "no dynamic score is over train.zeta: the deformer is skipped".to_string();
             self.job.events.emit(&Event::Warning { object: "deformer".into(), message });
         }
-        state.deformer = Some(deformer);
         Ok(())
     }
 
@@ -198,15 +226,34 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// Writes the checkpoint of a run that ends because an image cannot be read, as an interruption does. The run's own error counts, whatever becomes of it.
-    fn save_before_error(&self, state: &mut TrainState) {
-        let Some(path) = self.checkpoint.as_ref().filter(|_| state.iteration > 0) else { return };
-        let at = format!("iteration {} of stage {}", state.iteration, state.stage.name());
-        let message = match self.save(state) {
-            Ok(()) => format!("an image cannot be read; everything until {at} is in {}, --resume continues", path.display()),
-            Err(error) => format!("an image cannot be read, and what was learned until {at} is lost: {error}"),
-        };
-        self.job.events.emit(&Event::Warning { object: "training".into(), message });
+    /// `result`. Where it says that an image cannot be read, the checkpoint is written before, as an interruption does, unless nothing was learned yet. The run's own
+    /// error counts, whatever becomes of it.
+    pub(super) fn saved_before_error<T>(&self, result: Result<T>, state: &mut TrainState) -> Result<T> {
+        let learned = state.iteration > 0 || (state.stage > Stage::Coarse && self.lengths.length(Stage::Coarse) > 0);
+        if let Some(path) = self.checkpoint.as_ref().filter(|_| learned && is_lost_image(&result)) {
+            let at = format!("iteration {} of stage {}", state.iteration, state.stage.name());
+            let message = match self.save(state) {
+                Ok(()) => format!("an image cannot be read; everything until {at} is in {}, --resume continues", path.display()),
+                Err(error) => format!("an image cannot be read, and what was learned until {at} is lost: {error}"),
+            };
+            self.job.events.emit(&Event::Warning { object: "training".into(), message });
+        }
+        result
+    }
+
+    /// As [`Context::saved_before_error`], but for a main stage that has its key frames and no iteration: it would get them again when it is resumed.
+    fn saved_if_resumable<T>(&self, result: Result<T>, state: &mut TrainState) -> Result<T> {
+        let resumable = state.iteration > 0 || state.stage != Stage::Main || self.job.config.train.key_frames == 0;
+        if resumable { self.saved_before_error(result, state) } else { result }
+    }
+
+    /// As [`Context::saved_before_error`], in the middle of an iteration: the checkpoint is that of the state that `watchdog` remembers, where the log was `log`.
+    fn good_saved_before_error<T>(&self, result: Result<T>, watchdog: &Watchdog, log: LogRecord, state: &mut TrainState) -> Result<T> {
+        if is_lost_image(&result) && watchdog.return_to_good(self, state).is_ok() {
+            state.record.log = log;
+            return self.saved_if_resumable(result, state);
+        }
+        result
     }
 
     /// Writes the checkpoint, where the run has a folder.

@@ -165,7 +165,7 @@ impl<'a> Tuner<'a> {
             lengths: StageLengths::new(&config.train, false, scene.extent()),
             rasterizer: registry.build_rasterizer(&config.rasterizer)?,
             losses: LossTerms::build(registry, &config.loss)?,
-            score_loss: LossTerms::build(registry, std::slice::from_ref(&config.score_loss))?,
+            score_loss: LossTerms::build_score(registry, &config.score_loss)?,
             background: Tensor::from_floats(config.background()?, device),
             device: (*device).clone(),
             seed,

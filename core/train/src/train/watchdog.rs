@@ -188,7 +188,7 @@ impl Watchdog {
         iteration <= self.attempts.checked_until
     }
     /// After an iteration of `length`: looks at the parameters where it is time for it or where the state is about to be written, which `saves` says, and goes back
-    /// where `trouble` was found before or is found now.
+    /// where `trouble` was found before or is found now. [`Watchdog::remember`] comes after what else belongs to the iteration.
     ///
     /// # Errors
     /// [`Error::Backend`] that names the source, after too many attempts.
@@ -198,19 +198,26 @@ impl Watchdog {
             None if self.checks(iteration, length, saves) => unsound(state)?,
             trouble => trouble,
         };
-        match trouble {
-            Some(trouble) => {
-                self.go_back(context, state, trouble)?;
-                state.record.attempts = self.attempts;
-                Ok(())
-            }
-            None => {
-                if due(iteration, length) {
-                    self.good = Good::of(state);
-                }
-                Ok(())
-            }
+        if let Some(trouble) = trouble {
+            self.go_back(context, state, trouble)?;
+            state.record.attempts = self.attempts;
         }
+        Ok(())
+    }
+    /// Remembers the sound `state` after an iteration of a stage of `length`, where it is time for it. Returns whether it did.
+    pub fn remember(&mut self, state: &TrainState, length: usize) -> bool {
+        let due = due(state.iteration, length);
+        if due {
+            self.good = Good::of(state);
+        }
+        due
+    }
+    /// Makes `state` the last one that was remembered, or the one that the watchdog began with.
+    ///
+    /// # Errors
+    /// What building the deformer and restoring the state of plug-ins report.
+    pub fn return_to_good(&self, context: &Context, state: &mut TrainState) -> Result<()> {
+        self.good.restore(state, context)
     }
 
     fn go_back(&mut self, context: &Context, state: &mut TrainState, trouble: Trouble) -> Result<()> {

@@ -14,10 +14,13 @@ use timeline::timeline;
 
 use cc4dgs_core::reader::files::{file_name, has_extension};
 use cc4dgs_core::{Error, ImageSource, Limits, Result, SceneOptions, Seed, plural};
+use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 /// The first video stream that is not a cover image.
 const STREAM: &str = "V:0";
@@ -28,6 +31,49 @@ const EXTRACT: &str = "extract the frames yourself: into a folder per camera (ca
                        each with its \"time\"";
 /// The most bytes of messages that are read from a command.
 const MESSAGES: u64 = 1 << 16;
+
+/// Whether [`answers_interrupts`] was called.
+static ANSWERS_INTERRUPTS: AtomicBool = AtomicBool::new(false);
+
+/// Says that this program goes on after Ctrl-C, to stop at a safe point: Ctrl-C then does not reach ffmpeg, and a video that is being decoded is decoded to its end.
+/// Without this call Ctrl-C ends ffmpeg together with the program. Else ffmpeg would go on alone, and its frames would stay in the cache without a use.
+pub fn answers_interrupts() {
+    ANSWERS_INTERRUPTS.store(true, Ordering::Relaxed);
+}
+
+/// The processes that [`run`] waits for.
+static RUNNING: Mutex<BTreeSet<u32>> = Mutex::new(BTreeSet::new());
+
+/// Asks all ffmpeg processes that decode videos to end. A program that [`answers_interrupts`] calls it before it ends at once, because they would go on alone.
+pub fn end_commands() {
+    RUNNING.lock().unwrap_or_else(PoisonError::into_inner).iter().for_each(|id| ask_to_end(*id));
+}
+
+#[cfg(unix)]
+fn ask_to_end(id: u32) {
+    // A process that has just ended cannot be asked.
+    Command::new("kill").arg(id.to_string()).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status().ok();
+}
+
+/// Ctrl-C reaches them there.
+#[cfg(not(unix))]
+fn ask_to_end(_: u32) {}
+
+/// A process while it is in [`RUNNING`].
+struct Listed(u32);
+
+impl Listed {
+    fn new(id: u32) -> Self {
+        RUNNING.lock().unwrap_or_else(PoisonError::into_inner).insert(id);
+        Self(id)
+    }
+}
+
+impl Drop for Listed {
+    fn drop(&mut self) {
+        RUNNING.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.0);
+    }
+}
 
 /// The endings of videos, in lower case: of the containers that cameras and programs write and ffmpeg reads.
 pub(super) const ENDINGS: [&str; 16] = ["3gp", "avi", "flv", "m2ts", "m4v", "mkv", "mov", "mp4", "mpeg", "mpg", "mts", "mxf", "ogv", "ts", "webm", "wmv"];
@@ -148,9 +194,11 @@ fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64, writes: Opt
     let stderr = messages.try_clone().map_err(failed)?;
     let mut command = Command::new(program);
     command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr);
-    // Ctrl-C is for this program, which ends after the video.
+    // Where this program answers Ctrl-C, it ends after the video.
     #[cfg(unix)]
-    std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    if ANSWERS_INTERRUPTS.load(Ordering::Relaxed) {
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    }
     let mut child = command.spawn().map_err(|e| {
         Error::unsupported(
             object(),
@@ -158,8 +206,11 @@ fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64, writes: Opt
             format!("Install ffmpeg, set scene.ffmpeg to its path, or {EXTRACT}"),
         )
     })?;
+    let listed = Listed::new(child.id());
     let mut printed = Vec::new();
     let read = child.stdout.take().map_or(Ok(0), |pipe| pipe.take(most.saturating_add(1)).read_to_end(&mut printed));
+    // Before it is waited for: after that, another process may have its number.
+    drop(listed);
     if read.is_err() || printed.len() as u64 > most {
         let _ = child.kill();
         let _ = child.wait();
@@ -183,4 +234,48 @@ fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64, writes: Opt
         return Err(Error::data(object(), format!("{program} failed: {last}"), remedy));
     }
     Ok(printed)
+}
+
+#[cfg(test)]
+mod tests {
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn interrupts_reach_commands_unless_the_program_answers_them() {
+        use super::*;
+        let group_of_command = || {
+            let script = OsStr::new("cut -d ' ' -f 5 /proc/$$/stat");
+            let printed = run("sh", &[OsStr::new("-c"), script], Path::new("a.mp4"), 100, None).unwrap();
+            String::from_utf8(printed).unwrap().trim().to_string()
+        };
+        let status = std::fs::read_to_string("/proc/self/stat").unwrap();
+        // State, parent and group follow the name of the program, which is in parentheses.
+        let own = status.rsplit(')').next().unwrap().split_whitespace().nth(2).unwrap().to_string();
+        assert_eq!(group_of_command(), own);
+        answers_interrupts();
+        assert_ne!(group_of_command(), own);
+        ANSWERS_INTERRUPTS.store(false, Ordering::Relaxed);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn commands_that_are_waited_for_can_be_ended() {
+        use super::*;
+        use std::time::{Duration, Instant};
+        let seconds = "61.25";
+        let waiting = std::thread::spawn(move || run("sleep", &[OsStr::new(seconds)], Path::new("a.mp4"), 100, None));
+        // Other tests have commands, too.
+        let is_ours = |id: &u32| std::fs::read(format!("/proc/{id}/cmdline")).is_ok_and(|line| String::from_utf8_lossy(&line).contains(seconds));
+        let find = || RUNNING.lock().unwrap_or_else(PoisonError::into_inner).iter().copied().find(is_ours);
+        let began = Instant::now();
+        let id = loop {
+            match find() {
+                Some(id) => break id,
+                None => assert!(began.elapsed() < Duration::from_secs(30), "the command is not listed"),
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        ask_to_end(id);
+        assert!(waiting.join().unwrap().is_err() && began.elapsed() < Duration::from_secs(50));
+        assert!(find().is_none(), "what has ended is not listed");
+    }
 }

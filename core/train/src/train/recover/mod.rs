@@ -91,11 +91,12 @@ impl Context<'_> {
         if tracks.is_empty() || too_few {
             return Ok(());
         }
-        let places = self.places(state.set.len()).map_or(usize::MAX, |places| (places / seeds::PER_TRACK).max(1));
+        let most = self.most_added(state.set.len()).map_or(usize::MAX, |most| (most / seeds::PER_TRACK).max(1));
         let found = tracks.len();
-        let tracks = most_seen(&tracks, places);
+        let tracks = most_seen(&tracks, most);
         if tracks.len() < found {
-            let message = format!("tracks with fewer regions are left out, {} of {found}: density.max_gaussians leaves no more places", found - tracks.len());
+            let message =
+                format!("tracks with fewer regions are left out, {} of {found}: density.max_gaussians allows no more Gaussians", found - tracks.len());
             self.job.events.emit(&Event::Note { object: "recover".into(), message });
         }
         self.give_lives(state)?;
