@@ -43,7 +43,8 @@ impl Camera {
         [m[2][0], m[2][1], m[2][2]]
     }
     /// A camera at `eye_world` that looks at `target_world`; `up_world` points up in the image. `size` is width and height in pixels, `fov_x_rad` the full
-    /// horizontal angle.
+    /// horizontal angle. Where the eye is the target, or `up_world` is along the line between them, the transform is not finite, which [`Camera::validate`]
+    /// refuses.
     pub fn look_at(name: &str, size: (u32, u32), fov_x_rad: f64, eye_world: [f64; 3], target_world: [f64; 3], up_world: [f64; 3]) -> Self {
         let eye = DVec3::from(eye_world);
         let forward = (DVec3::from(target_world) - eye).normalize();

@@ -181,9 +181,16 @@ impl HostGaussians {
     pub fn validate_read(&self, object: &str, limits: &Limits) -> Result<()> {
         self.check(object, limits, "The file is damaged; fetch or write it again")
     }
-    fn check(&self, object: &str, limits: &Limits, remedy: &str) -> Result<()> {
+    /// Refuses arrays of unequal length and a degree above 4, of Gaussians that a program made or changed: what cannot be uploaded. Values may be any. `object`
+    /// names them in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`] that names the array.
+    pub fn validate_shapes(&self, object: &str) -> Result<()> {
+        self.check_shapes(object, "Correct the program that made them")
+    }
+    fn check_shapes(&self, object: &str, remedy: &str) -> Result<()> {
         let n = self.len();
-        limits.check_gaussians(object, n as u64)?;
         if self.sh_degree > 4 {
             return Err(Error::data(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree), "Convert the model to degree 4 or lower"));
         }
@@ -192,6 +199,15 @@ impl HostGaussians {
             if values.len() != n * width {
                 return Err(Error::data(object, format!("{name} has {} values, {n} Gaussians need {}", values.len(), n * width), remedy));
             }
+        }
+        Ok(())
+    }
+    fn check(&self, object: &str, limits: &Limits, remedy: &str) -> Result<()> {
+        let n = self.len();
+        limits.check_gaussians(object, n as u64)?;
+        self.check_shapes(object, remedy)?;
+        let extra = self.extra.iter().map(|(name, a)| (name.as_str(), a.width, &a.values));
+        for (name, width, values) in self.columns().into_iter().chain(extra) {
             if let Some(i) = first_not_finite(values) {
                 return Err(Error::data(object, format!("{name} of Gaussian {} is {}", i / width.max(1), values[i]), remedy));
             }

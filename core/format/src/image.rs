@@ -31,9 +31,12 @@ impl Image8 {
         }
         Ok(())
     }
-    /// Linear planes `[3,H,W]` in 0..1, alpha composited over `background`.
+    /// Planes `[3,H,W]`, the values over 255, alpha composited over `background`.
+    ///
+    /// # Panics
+    /// For an image without channels, which [`Image8::validate`] refuses.
     pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
-        let pixels = (self.width * self.height) as usize;
+        let pixels = self.width as usize * self.height as usize;
         let mut planes = vec![0.0f32; 3 * pixels];
         let (red, rest) = planes.split_at_mut(pixels);
         let (green, blue) = rest.split_at_mut(pixels);
@@ -52,8 +55,11 @@ impl Image8 {
         }
     }
     /// The RGB image of planes `[3,H,W]`: clamped to 0..1, `value * 255 + 0.5` truncated (the protocol of published tables).
+    ///
+    /// # Panics
+    /// For fewer values than three planes of `width * height` pixels have.
     pub fn from_planes(planes: &[f32], width: u32, height: u32) -> Self {
-        let pixels = (width * height) as usize;
+        let pixels = width as usize * height as usize;
         let mut data = vec![0u8; 3 * pixels];
         for (i, px) in data.chunks_exact_mut(3).enumerate() {
             for k in 0..3 {

@@ -238,7 +238,8 @@ pub fn start_deformer(name: &str, deformer: &mut dyn Deformer, first: &HostGauss
 ///
 /// The time-invariant half is a separate call, so that playback can cache it. Training recomputes it every step.
 pub trait Deformer: Send {
-    /// Features of M Gaussians, from their centres and the attributes of [`Deformer::attributes`].
+    /// Features of M Gaussians, from their centres and the attributes of [`Deformer::attributes`]. Those of a Gaussian do not depend on which others are in `input`:
+    /// training, playback and baking ask about different ones.
     ///
     /// # Errors
     /// [`Error::Parameter`] for Gaussians without these attributes, as [`SpatialInput::check`] returns it.
@@ -247,7 +248,8 @@ pub trait Deformer: Send {
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
     }
-    /// Offsets at `time_norm` (0 at the first frame, 1 at the last) for the M Gaussians of `features` `[M,F]`; the same heads at every time.
+    /// Offsets at `time_norm` (0 at the first frame, 1 at the last) for the M Gaussians of `features` `[M,F]`; the same heads at every time. They depend on
+    /// features, weights, progress and time alone: features may be older than the last ones that [`Deformer::spatial`] returned.
     ///
     /// # Errors
     /// [`Error::Parameter`] for a time that is not finite.

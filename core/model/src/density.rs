@@ -95,7 +95,7 @@ impl DensityPlan {
     pub fn unchanged(count: usize) -> Self {
         Self { parents: (0..count).collect(), fresh: vec![false; count], ..Self::default() }
     }
-    /// Keeps the old row `row` with its optimizer state; returns its new row.
+    /// Keeps the old row `row` with its optimizer state; returns its new row. Keep a row once, and add others like it with [`DensityPlan::copy`].
     pub fn keep(&mut self, row: usize) -> usize {
         self.add(row, false)
     }
@@ -242,6 +242,11 @@ fn index_tensor(rows: &[usize], device: &Device) -> Tensor<1, Int> {
 }
 
 /// Adds, moves and removes Gaussians during the coarse and the main stage. It owns its settings, its statistics, and its state in checkpoints.
+///
+/// A stage begins with [`begin_stage`](Self::begin_stage). The calls of an iteration are, in this order: [`statistics`](Self::statistics),
+/// [`observe`](Self::observe) for every view, the step of the optimizer, [`after_step`](Self::after_step), [`hold`](Self::hold), [`plan`](Self::plan), and, if there
+/// is a plan, [`executed`](Self::executed). Between iterations, and before the first one, `executed` is also called for plans of the trainer, which
+/// [`plan`](Self::plan) did not return. Where a run is resumed, a new control gets [`restore`](Self::restore) in place of `begin_stage`.
 pub trait DensityControl: Send {
     /// A stage begins with `count` Gaussians: statistics start from zero. Also called before [`DensityControl::restore`] where the trainer goes back to an earlier
     /// state of the stage.
@@ -256,11 +261,13 @@ pub trait DensityControl: Send {
     /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`]) and puts
     /// those that move first, executes it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
-    /// The Gaussians are now those of `plan`: statistics per Gaussian must follow its rows. Default: nothing, for controls that keep none.
+    /// The Gaussians are now those of `plan`: statistics per Gaussian must follow its rows ([`DensityPlan::parents`] are the old ones, in any order). It may be
+    /// another plan than [`DensityControl::plan`] returned last. Default: nothing, for controls that keep none.
     fn executed(&mut self, _plan: &DensityPlan, _device: &Device) -> Result<()> {
         Ok(())
     }
-    /// Called after every optimizer step. Returns attributes with new values for all rows `[N,width]`; their optimizer state is kept (for the noise of 3DGS-MCMC).
+    /// Called after every optimizer step, before [`DensityControl::plan`]. Returns attributes with new values for all rows `[N,width]`; their optimizer state is
+    /// kept (for the noise of 3DGS-MCMC).
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
     }

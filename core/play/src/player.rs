@@ -134,7 +134,7 @@ impl<'a> Player<'a> {
     /// Uploads the model. Where it has no background of its own, it is drawn on black; see [`Player::on`].
     ///
     /// # Errors
-    /// What the rasterizer says of the model's `[rasterizer]` section.
+    /// [`Error::Data`] for arrays of Gaussians that differ in length, and what the rasterizer says of the model's `[rasterizer]` section.
     pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
         Self::with_shortcuts(model, registry, device, PlayShortcuts::default())
     }
@@ -143,6 +143,8 @@ impl<'a> Player<'a> {
     /// # Errors
     /// As [`Player::new`].
     pub fn with_shortcuts(model: &'a Model, registry: &Registry, device: &Device, shortcuts: PlayShortcuts) -> Result<Self> {
+        // A program may have changed them since the model was opened.
+        model.gaussians.validate_shapes("Gaussians to play")?;
         let n = model.gaussians.len();
         let moves = model.field.as_ref().is_some_and(|f| !f.field.is_static());
         let rows = if moves { model.moving.rows(&model.gaussians.dynamic_scores) } else { Some(Vec::new()) };
@@ -189,8 +191,14 @@ impl<'a> Player<'a> {
     pub fn moving(&self) -> usize {
         self.moving
     }
-    /// The Gaussians at `time_norm`, moving ones first.
+    /// The Gaussians at `time_norm`, moving ones first: 0 is the first frame, 1 the last. What comes before 0 and after 1 depends on the deformer.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for a time that is not finite, and what the deformer reports.
     pub fn gaussians_at(&mut self, time_norm: f32) -> Result<Gaussians> {
+        if !time_norm.is_finite() {
+            return Err(Error::parameter("player", format!("the time {time_norm} is not a number"), "Use a time from 0 (first frame) to 1 (last frame)"));
+        }
         self.work.frames += 1;
         self.work.deformed += self.moving as u64;
         self.work.static_skipped += (self.frame.len() - self.moving) as u64;
@@ -223,6 +231,9 @@ impl<'a> Player<'a> {
         Ok(self.frame.clone())
     }
     /// The 8-bit RGB image that `camera` sees at `time_norm` (0 to 1).
+    ///
+    /// # Errors
+    /// As [`Player::gaussians_at`], and [`Error::Data`] for a camera that [`Camera::validate`] refuses.
     pub fn frame(&mut self, camera: &Camera, time_norm: f32) -> Result<Image8> {
         let planes = self.render(camera, time_norm)?.0.planes;
         self.download(planes)

@@ -34,6 +34,7 @@ mod manifests;
 mod observer;
 mod orbit;
 mod planted;
+mod planted_state;
 mod pose_runs;
 mod poses;
 mod raster;

@@ -1,6 +1,6 @@
 //! The library as used by a program.
 
-use cc4dgs::{Error, Event, Orbit, RunConfig, Session, Split};
+use cc4dgs::{Camera, Error, Event, Orbit, RunConfig, Session, Split};
 use cc4dgs_core::{Seed, Similarity, ply, resolved_device};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -201,4 +201,28 @@ fn a_ply_in_any_unit_looks_the_same() {
         let worst = image(scale).iter().zip(&usual).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 2, "scaled by {scale}: a value differs by {worst}");
     }
+}
+
+#[test]
+fn players_refuse_what_cannot_be_drawn() {
+    let session = flex();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("model.ply");
+    ply::write(&file, &crate::raster::scene(20, Seed::root(3)), false).unwrap();
+    let mut model = session.open(&file).unwrap();
+    let camera = Orbit { size: (16, 12), frames: 1, ..Orbit::default() }.around(&model.gaussians).unwrap().remove(0);
+    let frame = |camera: &Camera, time_norm: f32| session.player(&model).unwrap().frame(camera, time_norm).map_err(|e| e.to_string());
+    assert_eq!(frame(&camera, 0.5).unwrap().data.len(), 3 * 16 * 12);
+    assert!(frame(&Camera { width: 0, ..camera.clone() }, 0.5).unwrap_err().contains("image size 0x12 is empty"));
+    // Nothing moves, but a time that is no number is a mistake of the program all the same.
+    for time_norm in [f32::NAN, f32::INFINITY] {
+        assert!(frame(&camera, time_norm).unwrap_err().contains("is not a number"));
+    }
+    let eye = camera.center_world();
+    let nowhere = Camera::look_at("nowhere", (16, 12), 1.0, eye, eye, [0.0, 0.0, 1.0]);
+    assert!(frame(&nowhere, 0.5).unwrap_err().contains("camera nowhere: a parameter is not finite"));
+    // A program may change a model.
+    model.gaussians.means.truncate(57);
+    let refused = session.player(&model).err().unwrap().to_string();
+    assert!(refused.starts_with("Gaussians to play: means has 57 values, 20 Gaussians need 60"), "{refused}");
 }

@@ -9,12 +9,14 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 const MARK: &str = "conformance-mark";
 /// Damaged versions tried per stream.
 const DAMAGES: usize = 24;
+/// How far from the origin the Gaussians of [`far`] are along each axis; their centres differ by some 2.
+const FAR: f32 = 1000.0;
 
 /// Tests a codec. Each finding is a line; an empty list means that it passed.
 ///
 /// - Its schema is TOML that it accepts; unknown settings and profiles are refused by name.
 /// - Decoding gives the same Gaussians in any order, with extra attributes bit for bit or as [`ExtraAttribute`] allows.
-/// - The error of each column is at most the declared one, also where all Gaussians are alike.
+/// - The error of each column is at most the declared one, also where all Gaussians are alike, and where they are far from the origin.
 /// - Equal inputs give equal bytes, whatever the number of threads. Streams have names that an archive can hold, and are decoded in any order.
 /// - Where [`AttributeCodec::keeps_motion`] says so, scores stay on their side of the threshold.
 /// - Sets of no Gaussians and of one Gaussian can be stored; values that are not finite, in any column or attribute, and columns of a wrong length are refused.
@@ -41,6 +43,7 @@ pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec
         note(&format!("{count} Gaussians of degree {degree}"), comes_back(codec, &scene(count, degree)));
     }
     note("90 Gaussians that are alike", comes_back(codec, &alike(90, 1)));
+    note("90 Gaussians far from the origin", comes_back(codec, &far(90, 1)));
     note("repeats", repeats(codec));
     note("motion", keeps_motion(codec));
     for (count, degree) in [(0, 1), (1, 2), (300, 3)] {
@@ -89,6 +92,13 @@ fn alike(count: usize, sh_degree: usize) -> HostGaussians {
     for ((_, _, values), (_, _, row)) in g.columns_mut().into_iter().zip(first.columns()) {
         *values = row.repeat(count);
     }
+    g
+}
+
+/// The Gaussians of [`scene`], far from the origin, where a rounding that is relative to the values loses more of what they differ by.
+fn far(count: usize, sh_degree: usize) -> HostGaussians {
+    let mut g = scene(count, sh_degree);
+    g.means.iter_mut().for_each(|mean| *mean += FAR);
     g
 }
 

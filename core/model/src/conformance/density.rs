@@ -17,12 +17,21 @@ const ITERATIONS: usize = 320;
 const FRAMES: usize = 20;
 /// Name of the extra attribute that identifies the Gaussians.
 const LABEL: &str = "conformance-label";
+/// Iterations between two plans that the suite makes without the control, as the trainer does, and the first of them.
+const TRAINER_EVERY: usize = 64;
+const TRAINER_FIRST: usize = 7;
+/// The setting that bounds the number of Gaussians, and the bound that the suite states: little above [`COUNT`].
+const MAX_GAUSSIANS: &str = "max_gaussians";
+const BOUND: usize = COUNT + 4;
 
 /// Tests a density control on `device`, with a coarse and a main stage of random statistics: two views per iteration, at the times of 20 frames.
 /// Each finding is a line; an empty list means that it passed.
 ///
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
-/// - Plans refer to existing rows and attributes, set finite values, and never remove all Gaussians; half of what they remove is kept, as the trainer may.
+/// - Plans refer to existing rows and attributes, set finite values, never remove all Gaussians, and keep each row once at most; half of what they remove is
+///   kept, and rows are put into another order, as the trainer may.
+/// - Plans of the trainer, which it makes without asking, are followed: also before the first plan of the control's own.
+/// - A control with a setting `max_gaussians` does not grow beyond it.
 /// - Equal seeds give equal plans. State stored after any iteration continues with the same plans.
 /// - Stored state of another size is an error.
 /// - Gaussians without statistics, a single Gaussian, and centres and opacities that are not finite give plans or errors.
@@ -34,6 +43,7 @@ pub fn density(plugin: &DensityPlugin, settings: &toml::Table, device: &Device) 
             ("settings", Box::new(|| suite.settings_are_read())),
             ("plans", Box::new(|| suite.plans_are_sound())),
             ("state", Box::new(|| suite.state_continues())),
+            ("upper bound", Box::new(|| suite.upper_bound_is_kept())),
             ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
         ],
     )
@@ -98,8 +108,8 @@ impl Suite<'_> {
         seen.views = 2;
         seen
     }
-    /// One iteration: statistics, noise, plan. Returns the plan and the Gaussians after it.
-    fn iterate(&self, control: &mut dyn DensityControl, gaussians: Gaussians, schedule: &Schedule) -> Result<(Option<DensityPlan>, Gaussians)> {
+    /// One iteration: statistics, noise, plan. Returns the plan, which is sound, and the Gaussians that it is for.
+    fn planned(&self, control: &mut dyn DensityControl, gaussians: Gaussians, schedule: &Schedule) -> Result<(Option<DensityPlan>, Gaussians)> {
         let seed = Seed::root(43).child(schedule.stage.name()).index(schedule.iteration as u64);
         let wanted = control.statistics(schedule);
         for camera in 0..2 {
@@ -109,11 +119,26 @@ impl Suite<'_> {
         for (name, values) in control.after_step(&gaussians, schedule, seed.child("noise"))? {
             gaussians = replaced(&gaussians, &name, values)?;
         }
-        let mut plan = control.plan(&gaussians, schedule, seed.child("plan"))?;
+        control.hold(0);
+        let plan = control.plan(&gaussians, schedule, seed.child("plan"))?;
+        if let Some(plan) = &plan {
+            plan.check(self.plugin.info.name, &gaussians)?;
+            if let Some(row) = kept_twice(plan, gaussians.len()) {
+                let remedy = "Keep it once, and add copies with DensityPlan::copy, which start without momentum";
+                return Err(Error::backend("conformance", format!("a plan keeps row {row} twice, with its optimizer state"), remedy));
+            }
+        }
+        Ok((plan, gaussians))
+    }
+    /// As [`Suite::planned`], and carries the plan out. Returns what was carried out and the Gaussians after it.
+    fn iterate(&self, control: &mut dyn DensityControl, gaussians: Gaussians, schedule: &Schedule) -> Result<(Option<DensityPlan>, Gaussians)> {
+        let (mut plan, mut gaussians) = self.planned(control, gaussians, schedule)?;
         if let Some(plan) = &mut plan {
-            // The trainer may keep rows that a plan removes.
+            // The trainer may keep rows that a plan removes, and puts those that move first.
             let removed = plan.removed(gaussians.len());
             plan.restore(&removed[..removed.len() / 2]);
+            let order: Vec<usize> = (0..plan.len()).step_by(2).chain((1..plan.len()).step_by(2)).collect();
+            plan.reorder(&order);
             gaussians = self.execute(control, plan, &gaussians)?;
         }
         Ok((plan, gaussians))
@@ -129,9 +154,17 @@ impl Suite<'_> {
         let mut run = Run { plans: Vec::new(), end: self.gaussians(COUNT) };
         for stage in [Stage::Coarse, Stage::Main] {
             control.begin_stage(run.end.len(), self.device);
+            if stage == Stage::Main {
+                // As points of key frames are added.
+                run.end = self.execute(control.as_mut(), &of_trainer(run.end.len(), true), &run.end)?;
+            }
             for iteration in 1..=ITERATIONS {
                 let (plan, next) = self.iterate(control.as_mut(), run.end, &Self::schedule(stage, iteration))?;
                 (run.end, _) = (next, run.plans.push(plan));
+                if iteration % TRAINER_EVERY == TRAINER_FIRST {
+                    let adds = (iteration / TRAINER_EVERY).is_multiple_of(2);
+                    run.end = self.execute(control.as_mut(), &of_trainer(run.end.len(), adds), &run.end)?;
+                }
                 if stage == Stage::Main && stored_at == Some(iteration) {
                     let state = control.state();
                     control = self.build()?;
@@ -186,6 +219,29 @@ impl Suite<'_> {
         renamed.push(("conformance-no-such-array".into(), Tensor::zeros([COUNT], self.device)));
         Ok(self.build()?.restore(renamed, COUNT).is_ok().then(|| "stored state with an unknown array was accepted".into()))
     }
+    fn upper_bound_is_kept(&self) -> Result<Option<String>> {
+        let stated = config::parse_table(&format!("schema of density {}", self.plugin.info.name), self.plugin.info.schema)?;
+        if !stated.contains_key(MAX_GAUSSIANS) {
+            return Ok(None);
+        }
+        let mut settings = self.settings.clone();
+        settings.insert(MAX_GAUSSIANS.into(), (BOUND as i64).into());
+        let bounded = Suite { plugin: self.plugin, settings: &settings, device: self.device };
+        let (mut control, mut gaussians) = (bounded.build()?, self.gaussians(COUNT));
+        for stage in [Stage::Coarse, Stage::Main] {
+            control.begin_stage(gaussians.len(), self.device);
+            for iteration in 1..=ITERATIONS {
+                let (plan, before) = bounded.planned(control.as_mut(), gaussians, &Self::schedule(stage, iteration))?;
+                gaussians = before;
+                let Some(plan) = plan else { continue };
+                if plan.len() > BOUND.max(gaussians.len()) {
+                    return Ok(Some(format!("with {MAX_GAUSSIANS} = {BOUND}, {} Gaussians become {}", gaussians.len(), plan.len())));
+                }
+                gaussians = bounded.execute(control.as_mut(), &plan, &gaussians)?;
+            }
+        }
+        Ok(None)
+    }
     fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
         let mut odd = self.gaussians(5);
         odd.means = Tensor::from_floats([[f32::NAN, 0.0, 0.0], [f32::INFINITY, 0.0, 0.0], [0.0; 3], [0.0; 3], [0.0; 3]], self.device);
@@ -204,6 +260,26 @@ impl Suite<'_> {
         }
         Ok(None)
     }
+}
+
+/// A row of `count` that `plan` keeps more than once, with the momentum that it has in the optimizer.
+fn kept_twice(plan: &DensityPlan, count: usize) -> Option<usize> {
+    let mut kept = vec![false; count];
+    let rows = plan.parents().iter().zip(plan.fresh()).filter(|(_, fresh)| !**fresh).map(|(&row, _)| row);
+    rows.filter(|&row| row < count).find(|&row| std::mem::replace(&mut kept[row], true))
+}
+
+/// A plan that the trainer makes without asking the control: the rows are in another order, and a Gaussian is added (`adds`) or removed.
+fn of_trainer(count: usize, adds: bool) -> DensityPlan {
+    let mut plan = DensityPlan::new();
+    let first = usize::from(!adds && count > 1);
+    (first..count).rev().for_each(|row| {
+        plan.keep(row);
+    });
+    if adds {
+        plan.copy(0);
+    }
+    plan
 }
 
 /// `gaussians` with `values` `[N,width]` of the attribute `name`.

@@ -20,6 +20,8 @@ const SLOPE_TOLERANCE: f64 = 0.05;
 /// Change of values that have no gradient, and the largest relative change of the loss that is allowed for it.
 const MOVE: f32 = 0.01;
 const UNMOVED: f64 = 1e-5;
+/// Largest factor by which a value may grow where there are four times as many pixels or Gaussians of the same kind. That of a sum is 4.
+const MOST_GROWTH: f64 = 2.0;
 /// Largest relative difference between a fused term and the sum of its parts.
 const FUSED_TOLERANCE: f64 = 1e-4;
 
@@ -27,6 +29,7 @@ const FUSED_TOLERANCE: f64 = 1e-4;
 ///
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - The value is one finite number and repeats bit for bit.
+/// - It is no sum over pixels or Gaussians: four times as many, with the same values, do not give more than twice the value.
 /// - Gradients of the planes, of the Gaussians as drawn and of the canonical ones agree with finite differences.
 /// - Images of one pixel, sets without Gaussians, views without recorded depth and depth that is unknown everywhere give a value or `None`.
 /// - Where the Gaussians stand still, as in the coarse stage, value and gradients are finite.
@@ -44,6 +47,7 @@ pub fn loss_of_attributes(plugin: &LossPlugin, settings: &toml::Table, attribute
         vec![
             ("settings", Box::new(|| suite.settings_are_read())),
             ("value", Box::new(|| suite.value_is_a_number())),
+            ("normalisation", Box::new(|| suite.value_does_not_grow_with_counts())),
             ("gradients", Box::new(|| suite.gradients_are_slopes())),
             ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
             ("standing still", Box::new(|| suite.what_stands_still_has_a_gradient())),
@@ -151,6 +155,23 @@ fn inputs(size: [usize; 2], count: usize, attributes: &[AttributeSpec]) -> Input
     Inputs { planes, target: (0..3 * pixels).map(|k| draw(2, k)).collect(), depth: Some(depth), gaussians, canonical, size }
 }
 
+/// The same images twice in each direction.
+fn tiled(inputs: &Inputs) -> Inputs {
+    let [height, width] = inputs.size;
+    let twice = |planes: &Vec<f32>| -> Vec<f32> {
+        let wide = |plane: &[f32]| plane.chunks_exact(width).flat_map(|row| [row, row].concat()).collect::<Vec<f32>>();
+        planes.chunks_exact(height * width).flat_map(|plane| wide(plane).repeat(2)).collect()
+    };
+    let (planes, target, depth) = (twice(&inputs.planes), twice(&inputs.target), inputs.depth.as_ref().map(twice));
+    Inputs { planes, target, depth, size: [2 * height, 2 * width], ..inputs.clone() }
+}
+
+/// The same Gaussians four times.
+fn repeated(inputs: &Inputs) -> Inputs {
+    let rows = (0..inputs.gaussians.len()).collect::<Vec<usize>>().repeat(4);
+    Inputs { gaussians: inputs.gaussians.select(&rows), canonical: inputs.canonical.select(&rows), ..inputs.clone() }
+}
+
 /// The planes, or a column or attribute of the Gaussians by name.
 fn values_of<'a>(inputs: &'a mut Inputs, name: &str) -> Option<&'a mut Vec<f32>> {
     if name == "planes" {
@@ -209,6 +230,18 @@ impl Suite<'_> {
         }
         let (first, second) = (self.number(term.as_ref(), &inputs)?, self.number(term.as_ref(), &inputs)?);
         Ok((!first.is_finite() || first != second).then(|| format!("two values of one input are {first} and {second}")))
+    }
+    /// Weights of terms mean the same at every image size, and however many Gaussians density control leaves.
+    fn value_does_not_grow_with_counts(&self) -> Result<Option<String>> {
+        let (term, inputs) = (self.term()?, self.inputs(SIZE, COUNT));
+        let once = self.number(term.as_ref(), &inputs)?;
+        for (what, more) in [("pixels", tiled(&inputs)), ("Gaussians", repeated(&inputs))] {
+            let found = self.number(term.as_ref(), &more)?;
+            if !within(found, MOST_GROWTH * once.abs()) {
+                return Ok(Some(format!("four times as many {what} take the value from {once:.4e} to {found:.4e}: divide it by their number")));
+            }
+        }
+        Ok(None)
     }
     fn gradients_are_slopes(&self) -> Result<Option<String>> {
         let (term, inputs) = (self.term()?, self.inputs(SIZE, COUNT));

@@ -18,7 +18,7 @@ const FRESH_MOVES: f64 = 2.0;
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - It minimises a quadratic function.
 /// - Rows that are not visible keep values and state.
-/// - Selected rows take over the state of their parents; fresh rows move about as fast as they.
+/// - Selected rows take over the state of their parents; fresh rows have no momentum, and move about as fast as their parents.
 /// - After a restart it takes the same steps as a new optimizer, and arrays that are not named keep their state, also where their names begin alike; after
 ///   storing and restoring state, it takes the same steps as without.
 /// - Invalid state is an error.
@@ -32,6 +32,7 @@ pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Devi
             ("visible rows", Box::new(|| suite.leaves_hidden_rows())),
             ("rows", Box::new(|| suite.rows_follow_their_parents())),
             ("fresh rows", Box::new(|| suite.fresh_rows_keep_pace())),
+            ("momentum", Box::new(|| suite.fresh_rows_have_no_momentum())),
             ("state", Box::new(|| suite.state_continues())),
             ("restart", Box::new(|| suite.restarts_what_is_named())),
         ],
@@ -132,6 +133,16 @@ impl Suite<'_> {
         let (old, fresh) = (walk(optimizer.as_mut(), FRESH_STEPS)?, walk(renewed.as_mut(), FRESH_STEPS)?);
         let found = || format!("with equal gradients, fresh rows move {:.1} times as far as their parents in {FRESH_STEPS} steps", fresh / old);
         Ok((fresh > FRESH_MOVES * old).then(found))
+    }
+    fn fresh_rows_have_no_momentum(&self) -> Result<Option<String>> {
+        let mut optimizer = self.build()?;
+        self.descend(optimizer.as_mut(), self.start(), 5)?;
+        optimizer.select_rows("gaussians/", &(0..SHAPE[0]).collect::<Vec<_>>(), &[true; SHAPE[0]])?;
+        // Without a gradient nothing but momentum can move values of 0: they are not decayed.
+        let moved = to_vec(optimizer.step(NAME, self.start().zeros_like(), self.start().zeros_like(), &StepSettings::new(0.02))?, "values")?;
+        let farthest = moved.iter().fold(0.0f64, |most, v| most.max(f64::from(v.abs())));
+        Ok((moved.len() != SHAPE[0] * SHAPE[1] || farthest > 0.0 || moved.iter().any(|v| v.is_nan()))
+            .then(|| format!("without a gradient, fresh rows move by up to {farthest}")))
     }
     fn state_continues(&self) -> Result<Option<String>> {
         let mut whole = self.build()?;

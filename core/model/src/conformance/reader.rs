@@ -1,5 +1,9 @@
 //! The conformance suite of dataset readers.
 
+mod limits;
+mod order;
+mod points;
+
 use crate::reader::{ImageSource, InitBox, RawCamera, RawScene, RawView, ReaderPlugin, SceneOptions, files};
 use crate::{Error, Image8, Limits, Result, Seed, Split};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -21,8 +25,11 @@ const ABSURD: [&str; 6] = ["1e308", "-1", "99999999999999999999", "0", "nan", ""
 /// - It recognises the folder, and neither an empty nor a missing one.
 /// - Opening twice gives equal scenes.
 /// - Poses are rigid; times lie in 0..1 and increase with frames; there is a training view.
+/// - Points, or else the corners of the box, are in front of training cameras: not behind them, as where y and z axes point up and backwards.
+/// - Images that the reader loads itself are the same in any order.
 /// - Images and masks have the size of their cameras, or a scaled size of the same aspect; recorded depth has this aspect and can be read.
 /// - A scene marked as resized has the size of `scene.width`.
+/// - Index files of more bytes than the limits allow are refused.
 /// - Damaged copies of its files (truncated, flipped bits, absurd numbers) give errors or valid scenes, never a panic.
 ///
 /// The dataset is copied, not changed. A `folder` that does not exist is allowed for readers that compute their scenes.
@@ -37,7 +44,10 @@ pub fn reader(plugin: &ReaderPlugin, folder: &Path) -> Vec<String> {
         Err(e) => note("open", Err(e)),
         Ok(scene) => {
             note("scene", Ok(soundness(&scene)));
+            note("points", Ok(points::behind(&scene).into_iter().collect()));
             note("images", Ok(images(&scene)));
+            note("order of images", Ok(order::matters(&scene).into_iter().collect()));
+            note("limits", limits::kept(plugin, folder));
             note("repeats", repeats(plugin, folder, &scene));
             note("size", follows_the_size(plugin, folder, &scene));
             note("damaged files", survives_damage(plugin, folder));
@@ -48,7 +58,12 @@ pub fn reader(plugin: &ReaderPlugin, folder: &Path) -> Vec<String> {
 
 /// Opens and validates; a panic becomes an error.
 fn attempt(plugin: &ReaderPlugin, folder: &Path, options: &SceneOptions) -> Result<RawScene> {
-    let open = || (plugin.open)(folder, options, &LIMITS).and_then(|scene| scene.validate().map(|()| scene));
+    attempt_within(plugin, folder, options, &LIMITS)
+}
+
+/// As [`attempt`], within other limits.
+fn attempt_within(plugin: &ReaderPlugin, folder: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let open = || (plugin.open)(folder, options, limits).and_then(|scene| scene.validate().map(|()| scene));
     catch_unwind(AssertUnwindSafe(open)).unwrap_or_else(|_| Err(Error::backend(folder.display().to_string(), PANIC, "Return an error instead")))
 }
 

@@ -1,6 +1,7 @@
 //! The conformance suite of deformers.
 
 mod gradients;
+mod rows;
 
 use super::{guarded, uniform, within};
 use crate::gaussians::to_vec;
@@ -26,6 +27,7 @@ const CENTRES: usize = 48;
 /// - a deformer that declares `starts-as-identity` moves nothing initially, a static one never does;
 /// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer; a regularizer has a
 ///   gradient for every array that it depends on;
+/// - offsets depend on features, weights, progress and time alone, whatever was asked in between, and those of a Gaussian not on which others are asked about with it;
 /// - several times at once give the offsets of each; packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
 /// - `start_from` changes nothing but values of weights, whatever the number of Gaussians, and stored models are opened without it;
 /// - what `simplified` returns can be built again from its settings, and moves Gaussians in nearly the same way;
@@ -47,6 +49,8 @@ pub fn deformer(plugin: &DeformerPlugin, settings: &toml::Table, device: &Device
             ("regularizer", Box::new(|| suite.regularizer_is_sound())),
             ("progress", Box::new(|| suite.progress_is_followed())),
             ("weights", Box::new(|| suite.weights_carry_everything())),
+            ("features", Box::new(|| suite.features_carry_everything())),
+            ("rows", Box::new(|| suite.rows_do_not_depend_on_others())),
             ("several times", Box::new(|| suite.several_times_are_each())),
             ("packed", Box::new(|| suite.packing_changes_nothing())),
             ("simplified", Box::new(|| suite.simplified_does_the_same())),

@@ -41,7 +41,7 @@ impl LossTerm for Approach {
     }
 }
 
-/// The squared difference of rendered and recorded depth. With `strict`, a view without depth is an error.
+/// The mean squared difference of rendered and recorded depth. With `strict`, a view without depth is an error.
 struct Deep {
     wants: bool,
     strict: bool,
@@ -50,13 +50,31 @@ struct Deep {
 impl LossTerm for Deep {
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
         match input.depth {
-            Some(depth) => Ok(Some(ordered_sum((input.planes.clone().narrow(0, 4, 1) - depth.clone()).powi_scalar(2)))),
+            Some(depth) => {
+                let pixels = depth.dims().iter().product::<usize>();
+                Ok(Some(ordered_sum((input.planes.clone().narrow(0, 4, 1) - depth.clone()).powi_scalar(2)).div_scalar(pixels as f32)))
+            }
             None if self.strict => Err(Error::parameter("loss deep", "there is no depth", "Choose a scene that has some")),
             None => Ok(None),
         }
     }
     fn wants_depth(&self) -> bool {
         self.wants
+    }
+}
+
+/// The sum of squared differences of colours, or of squared opacity logits.
+struct Summed {
+    gaussians: bool,
+}
+
+impl LossTerm for Summed {
+    fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
+        if self.gaussians {
+            let logits = input.gaussians.opacity_logits.clone();
+            return Ok((!input.gaussians.is_empty()).then(|| ordered_sum(logits.powi_scalar(2))));
+        }
+        Ok(Some(ordered_sum((input.planes.clone().narrow(0, 0, 3) - input.target.clone()).powi_scalar(2))))
     }
 }
 
@@ -85,6 +103,18 @@ fn a_term_may_compare_with_the_canonical_gaussians_and_know_the_camera() {
         (|settings| plain(settings, Approach { root: false, share: 0.0 }), "gradients: no gradient reaches canonical means"),
     ];
     for (build, finding) in mistakes {
+        let found = findings(build, &[]);
+        assert!(found.iter().any(|line| line.contains(finding)), "{finding}: {found:?}");
+    }
+}
+
+#[test]
+fn sums_over_pixels_or_gaussians_are_found() {
+    let cases: [(Build, &str); 2] = [
+        (|settings| plain(settings, Summed { gaussians: false }), "normalisation: four times as many pixels"),
+        (|settings| plain(settings, Summed { gaussians: true }), "normalisation: four times as many Gaussians"),
+    ];
+    for (build, finding) in cases {
         let found = findings(build, &[]);
         assert!(found.iter().any(|line| line.contains(finding)), "{finding}: {found:?}");
     }
