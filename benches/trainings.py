@@ -1,4 +1,6 @@
 """Shared parts of the scripts that train: finished rows in a file, so that no training is repeated with the same program and settings, and Ctrl-C."""
+import contextlib
+import fcntl
 import hashlib
 import json
 import pathlib
@@ -28,21 +30,29 @@ def replace(file, document):
 
 
 class Rows:
-    """Finished rows in a JSON file. Each states what it depends on, and what was measured."""
+    """Finished rows in a JSON file. Each states what it depends on, and what was measured. Several threads and processes may share the file: it is read again for
+    every call, under a lock of the file beside it that is called as it is with `.lock` after the name."""
 
     def __init__(self, file):
-        self.file, self.lock = file, threading.Lock()
-        self.rows = json.loads(file.read_text()) if file.exists() else []
+        self.file, self.threads = file, threading.Lock()
+
+    @contextlib.contextmanager
+    def locked(self):
+        """The rows, which nothing else changes meanwhile."""
+        # On network file systems a lock may be one of the whole process, so threads have one of their own.
+        with self.threads, open(self.file.with_name(self.file.name + ".lock"), "a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield json.loads(self.file.read_text()) if self.file.exists() else []
 
     def find(self, stated):
         """The row that states the same. Rows of earlier versions of a script state less, and are not found."""
-        with self.lock:
-            return next((row for row in self.rows if stated.items() <= row.items()), None)
+        with self.locked() as rows:
+            return next((row for row in rows if stated.items() <= row.items()), None)
 
     def keep(self, row):
-        with self.lock:
-            self.rows.append(row)
-            replace(self.file, self.rows)
+        """Adds the row to those that the file has by now."""
+        with self.locked() as rows:
+            replace(self.file, [*rows, row])
 
 
 def events(out):

@@ -102,13 +102,23 @@ fn precise(value: f64) -> String {
 }
 
 /// A coloured square with a name.
-pub fn swatch(colour: &str, name: &str) -> String {
+fn swatch(colour: &str, name: &str) -> String {
     format!("<span><svg viewBox=\"0 0 12 12\" class=\"swatch\"><rect width=\"12\" height=\"12\" fill=\"{colour}\"/></svg>{}</span> ", html(name))
 }
 
+/// `name` in at most [`LABEL_CHARACTERS`]: of a longer one the beginning and the end, where its codec is.
+fn shortened(name: &str) -> String {
+    let letters: Vec<char> = name.chars().collect();
+    if letters.len() <= LABEL_CHARACTERS {
+        return name.to_string();
+    }
+    let first = LABEL_CHARACTERS / 2;
+    let last = letters.len() - (LABEL_CHARACTERS - 1 - first);
+    letters[..first].iter().chain(&['…']).chain(&letters[last..]).collect()
+}
+
 fn label(svg: &mut String, y: f64, name: &str) {
-    let short: String =
-        if name.chars().count() > LABEL_CHARACTERS { name.chars().take(LABEL_CHARACTERS - 1).chain(['…']).collect() } else { name.to_string() };
+    let short = shortened(name);
     _ = write!(svg, "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\"><title>{}</title>{}</text>", LABEL - 8.0, y + 15.0, html(name), html(&short));
 }
 
@@ -147,6 +157,15 @@ mod tests {
         assert!((edges[0].0 + edges[0].1 - edges[1].0).abs() < 0.11 && (edges[1].1 / edges[0].1 - 3.0).abs() < 0.01, "{edges:?}");
         assert!(svg.contains("&lt;x&gt;") && svg.contains(">4</text>"));
         assert_eq!((precise(0.0), precise(0.012_345), precise(123.4), precise(9.999)), ("0".into(), "0.0123".into(), "123".into(), "10".into()));
+    }
+
+    #[test]
+    fn long_labels_keep_their_codec() {
+        let name = |codec: &str| format!("{}, {} / {codec}", "hexplane-".repeat(4), "setting-".repeat(4));
+        let labels = ["cca-default", "cca-low"].map(|codec| shortened(&name(codec)));
+        assert!(labels[0].ends_with(" / cca-default") && labels[1].ends_with(" / cca-low") && labels[0].starts_with("hexplane-hexplane"), "{labels:?}");
+        assert!(labels.iter().all(|label| label.chars().count() == LABEL_CHARACTERS), "{labels:?}");
+        assert_eq!(shortened("cdf / cca"), "cdf / cca");
     }
 
     #[test]

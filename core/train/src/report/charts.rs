@@ -1,14 +1,15 @@
 //! The plots of a scene, made from its rows.
 
-use super::bars::{Bars, Strips, swatch};
+use super::bars::{Bars, Strips};
+use super::legend::{Entry, training_swatch};
 use super::pareto::front;
-use super::plot::{Axis, COLOURS, Entry, Plot, Point, Series, marker};
+use super::plot::{Axis, COLOURS, Plot, Point, Series, marker};
 use super::rows::{Better, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, RateCurve, Row, SIZE, SSIM, TRAINING};
 use super::text::html;
-use crate::sweep::{CellResult, TrainingDevices};
+use crate::sweep::{CellResult, TrainingDevices, interrupted};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// One colour per training and one marker per codec, the same in all plots of a report.
+/// One colour per training, with dots where there are more trainings than colours, and one marker per codec, the same in all plots of a report.
 #[derive(Debug)]
 pub struct Key {
     trainings: Vec<String>,
@@ -28,23 +29,33 @@ impl Key {
     fn marker(&self, row: &Row) -> usize {
         self.codecs.iter().position(|name| name == row.codec).unwrap_or(0)
     }
-    /// What the colours of a plot mean.
-    fn colours(&self, plot: &Plot) -> Vec<Entry> {
-        let entry = |(i, name): (usize, &String)| Entry { colour: Some(i), marker: None, name: name.clone() };
-        self.trainings.iter().enumerate().filter(|(i, _)| shows(plot, |s| s.colour == *i)).map(entry).collect()
+    /// The trainings with their indices and names; those that failed on the scene of `rows` say so.
+    fn named(&self, rows: &[Row]) -> Vec<(usize, String)> {
+        let failed: BTreeSet<usize> = rows.iter().filter(|row| row.hopeless()).map(|row| self.colour(row)).collect();
+        let named = |(i, name): (usize, &String)| (i, if failed.contains(&i) { format!("{name} (failed)") } else { name.clone() });
+        self.trainings.iter().enumerate().map(named).collect()
+    }
+    /// What the colours of a plot of `rows` mean.
+    fn colours(&self, plot: &Plot, rows: &[Row]) -> Vec<Entry> {
+        let shown = self.named(rows).into_iter().filter(|(i, _)| shows(plot, |s| s.colour == *i));
+        shown.map(|(i, name)| Entry { colour: Some(i), marker: None, name }).collect()
     }
     /// What the markers of a plot mean.
     fn markers(&self, plot: &Plot) -> Vec<Entry> {
         let entry = |(i, name): (usize, &String)| Entry { colour: None, marker: Some(i), name: name.clone() };
         self.codecs.iter().enumerate().filter(|(i, _)| shows(plot, |s| s.marker == Some(*i))).map(entry).collect()
     }
-    /// What colours and shapes mean.
-    pub fn legend(&self) -> String {
-        let colours: String = self.trainings.iter().enumerate().map(|(i, name)| swatch(COLOURS[i % COLOURS.len()], name)).collect();
+    /// What colours and shapes mean in the plots of `rows`.
+    fn legend(&self, rows: &[Row]) -> String {
+        let colours: String = self.named(rows).into_iter().map(|(i, name)| training_swatch(i, &name)).collect();
         let shape =
             |i: usize, name: &String| format!("<span><svg viewBox=\"0 0 14 14\" class=\"swatch\">{}</svg>{}</span> ", marker(i, 7.0, 7.0, "#333"), html(name));
         let shapes: String = self.codecs.iter().enumerate().map(|(i, name)| shape(i, name)).collect();
-        format!("<p class=\"legend\"><i>training:</i> {colours}</p><p class=\"legend\"><i>codec:</i> {shapes}</p>\n")
+        let repeated = match self.trainings.len() > COLOURS.len() {
+            true => "<p class=\"note\">Trainings of one colour differ in the dots below their markers and between the dashes of their lines.</p>",
+            false => "",
+        };
+        format!("<p class=\"legend\"><i>training:</i> {colours}</p><p class=\"legend\"><i>codec:</i> {shapes}</p>{repeated}\n")
     }
 }
 
@@ -86,8 +97,8 @@ pub(super) fn files(scene: &str, rows: &[Row], key: &Key, trained: &TrainingDevi
         let text = format!("{scene} {}", plot.title).to_lowercase();
         text.split(|c: char| !c.is_alphanumeric()).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".svg"
     };
-    let of_trainings = |plot: &Plot| key.colours(plot);
-    let of_points = |plot: &Plot| [key.colours(plot), key.markers(plot)].concat();
+    let of_trainings = |plot: &Plot| key.colours(plot, rows);
+    let of_points = |plot: &Plot| [key.colours(plot, rows), key.markers(plot)].concat();
     let file = |plot: &Plot, legend: Vec<Entry>| (name(plot), plot.file(&format!("{scene}: {}", plot.title), &legend));
     let points = plots.rate.iter().chain(&plots.cost).map(|plot| file(plot, of_points(plot)));
     points.chain(plots.progress.iter().map(|plot| file(plot, of_trainings(plot)))).collect()
@@ -97,17 +108,17 @@ pub(super) fn files(scene: &str, rows: &[Row], key: &Key, trained: &TrainingDevi
 pub(super) fn figures(rows: &[Row], key: &Key, trained: &TrainingDevices) -> String {
     let plots = |plots: &[Plot]| grid("", plots.iter().map(Plot::figure).collect());
     let Plots { rate, cost, progress } = Plots::of(rows, key, trained);
-    let note = "A point is the mean over seeds, its whisker the least and the largest seed. A line joins points of one training that differ in the rate of one codec alone: that of the Gaussians, or that of the deformer's weights. Where a method is stored by one codec, a line joins its settings.";
-    let mut out = heading("Rate and distortion", note) + &key.legend();
+    let note = "A point is the mean over seeds, its whisker the least and the largest seed. A line joins points of one training that differ in the rate of one codec alone: that of the Gaussians, or that of the deformer's weights. Where a method is stored by one codec, a line joins its settings, without trainings that failed.";
+    let mut out = heading("Rate and distortion", note) + &key.legend(rows);
     out += &plots(&rate);
 
     let note = "Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other; trainings that failed are left out. Left is cheaper. Training time is shown with the codec of the highest PSNR.";
-    out += &(heading("Time and size against error", note) + &key.legend());
+    out += &(heading("Time and size against error", note) + &key.legend(rows));
     out += &plots(&cost);
 
     out += &heading("Where time and bytes go", "");
     out += &grid(" bars", [stage_bars(rows, trained), frame_bars(rows), storage_bars(rows)].map(|bars| bars.figure()).concat());
-    out += &(heading("Training, frames, seeds", "") + &key.legend());
+    out += &(heading("Training, frames, seeds", "") + &key.legend(rows));
     out += &plots(&progress);
     if rows.iter().any(|row| row.cells.len() > 1) {
         let values = |row: &Row| row.cells.iter().filter_map(|cell| PSNR.of(cell)).collect();
@@ -117,13 +128,16 @@ pub(super) fn figures(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Str
     out
 }
 
-/// What stands below a plot of times of trainings that ran on different devices: these, and the mark of each training. Nothing where they are comparable.
-fn device_note(rows: &[Row], trained: &TrainingDevices) -> String {
-    if !trained.differ() {
-        return String::new();
+/// What stands below a plot of times of trainings: the devices where they differ, with the mark of each training, and which trainings were interrupted. Nothing
+/// where their times are comparable.
+fn times_note(rows: &[Row], trained: &TrainingDevices) -> String {
+    let (trainings, mut parts) = (trainings(rows), Vec::new());
+    if trained.differ() {
+        let marks: Vec<String> = trainings.iter().map(|row| row.training() + &trained.mark(&row.cells)).collect();
+        parts.push(format!("{} Here: {}.", trained.sentence(), marks.join("; ")));
     }
-    let marks: Vec<String> = trainings(rows).into_iter().map(|row| row.training() + &trained.mark(&row.cells)).collect();
-    format!("{} Here: {}.", trained.sentence(), marks.join("; "))
+    parts.extend(interrupted(trainings.iter().map(|row| (row.training(), row.cells.as_slice()))));
+    parts.join(" ")
 }
 
 fn heading(title: &str, note: &str) -> String {
@@ -161,7 +175,8 @@ fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
         let Some(point) = point(row, &SIZE, metric) else { continue };
         // Settings of a method that is stored in one way are points of a line, too. With several codecs there would be a line for each of them.
         let one_codec = rows.iter().all(|other| other.method != row.method || other.codec == row.codec);
-        for curve in row.rate_curves().into_iter().chain(one_codec.then(|| row.setting_curve())) {
+        let setting_curve = (one_codec && !row.hopeless()).then(|| row.setting_curve());
+        for curve in row.rate_curves().into_iter().chain(setting_curve) {
             curves.entry(curve).or_default().push((key.colour(row), point.clone()));
         }
     }
@@ -189,9 +204,11 @@ fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key, trained: 
     let means: Vec<(f64, f64)> = rows.iter().filter(|row| !row.hopeless()).filter_map(|row| point(row, cost, metric)).map(|p| (p.x, p.y)).collect();
     let mut best: Vec<(f64, f64)> = front(&means, metric.better == Better::Lower).into_iter().map(|i| means[i]).collect();
     let (mut series, mut note) = (points(rows, cost, metric, key), String::new());
+    if cost.key == TRAINING.key {
+        note = times_note(rows, trained);
+    }
     if cost.key == TRAINING.key && trained.differ() {
         best.clear();
-        note = device_note(rows, trained);
         for (row, own) in rows.iter().zip(&mut series) {
             own.points.iter_mut().for_each(|point| point.hint += &format!(", trained on{}", trained.mark(&row.cells)));
         }
@@ -244,7 +261,7 @@ fn stage_bars(rows: &[Row], trained: &TrainingDevices) -> Bars {
     };
     let lines = trainings(rows).iter().map(|row| (row.training(), values(row))).collect();
     let parts = stages.iter().cloned().chain(["reading, checks, saving".to_string()]).collect();
-    Bars { title: "Training by stage, mean over seeds".into(), axis: "wall time (s)".into(), parts, lines, note: device_note(rows, trained) }
+    Bars { title: "Training by stage, mean over seeds".into(), axis: "wall time (s)".into(), parts, lines, note: times_note(rows, trained) }
 }
 
 fn frame_bars(rows: &[Row]) -> Bars {
@@ -280,7 +297,7 @@ fn training_curves(rows: &[Row], key: &Key, times: Option<&TrainingDevices>) -> 
     } else {
         ("Training views by iteration, a line per seed", "iteration")
     };
-    let note = times.map_or_else(String::new, |trained| device_note(rows, trained));
+    let note = times.map_or_else(String::new, |trained| times_note(rows, trained));
     Plot { title: title.into(), x: Axis::linear(x), y: Axis::linear("PSNR of training views (dB)"), series, front: Vec::new(), note }
 }
 
@@ -309,7 +326,7 @@ fn validation_curves(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Plot
         y: Axis::linear("PSNR of validation views (dB)"),
         series: trainings(rows).iter().flat_map(of).collect(),
         front: Vec::new(),
-        note: format!("{} {}", views_note(rows), device_note(rows, trained)).trim().into(),
+        note: format!("{} {}", views_note(rows), times_note(rows, trained)).trim().into(),
     }
 }
 

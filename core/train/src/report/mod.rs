@@ -3,6 +3,7 @@
 mod bars;
 mod charts;
 mod images;
+mod legend;
 mod page;
 mod pareto;
 mod plot;

@@ -1,9 +1,10 @@
 //! Plots as SVG, inline or as files: axes with ticks and titles, lines, markers, bands of spread.
 
+use super::legend::{CHARACTER, Entry, LINE, dashes, dots, drawn, wrapped};
 use super::text::{html, short};
 use std::fmt::Write;
 
-/// Colours that stay apart for colour-blind readers and in print; beyond their number they repeat.
+/// Colours that stay apart for colour-blind readers and in print; beyond their number they repeat, with dots (`legend`).
 pub const COLOURS: [&str; 12] =
     ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#5b3e96", "#8c510a", "#3f3f3f", "#b2182b", "#7a8c00", "#00796b"];
 
@@ -15,11 +16,13 @@ const RIGHT: f64 = 14.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 46.0;
 
-/// Height of a line of a file's legend, and the width of a character there at most.
-const LEGEND_LINE: f64 = 18.0;
-const CHARACTER: f64 = 7.0;
+/// Height of a line of a file's heading, and the width of a character there at most.
+const HEADING_LINE: f64 = 17.0;
+const HEADING_CHARACTER: f64 = 8.0;
 /// Beside the note of a file.
 const MARGIN: f64 = 8.0;
+/// From a marker down to the dots of its training.
+const TO_DOTS: f64 = 8.5;
 const STYLE: &str = include_str!("plot.css");
 
 /// One axis.
@@ -56,23 +59,13 @@ pub struct Point {
 /// Points of one kind.
 #[derive(Clone, Debug)]
 pub struct Series {
-    /// Index into [`COLOURS`].
+    /// Index of the training, which gives the colour out of [`COLOURS`] and the dots.
     pub colour: usize,
     /// Index of the [`marker`]; none for plain lines.
     pub marker: Option<usize>,
     /// Whether the points are joined.
     pub line: bool,
     pub points: Vec<Point>,
-}
-
-/// An entry of a legend.
-#[derive(Clone, Debug)]
-pub struct Entry {
-    /// Index into [`COLOURS`]; black where absent.
-    pub colour: Option<usize>,
-    /// Index of the [`marker`]; a square where absent.
-    pub marker: Option<usize>,
-    pub name: String,
 }
 
 /// A plot.
@@ -206,24 +199,6 @@ pub(super) fn footnote(note: &str) -> String {
     if note.is_empty() { String::new() } else { format!("<p class=\"note\">{}</p>", html(note)) }
 }
 
-/// `text` in lines of at most `most` characters, broken between words where that is possible.
-fn wrapped(text: &str, most: usize) -> Vec<String> {
-    let mut lines: Vec<String> = Vec::new();
-    for word in text.split_whitespace() {
-        let letters: Vec<char> = word.chars().collect();
-        for piece in letters.chunks(most) {
-            match lines.last_mut().filter(|line| line.chars().count() + 1 + piece.len() <= most) {
-                Some(line) => {
-                    line.push(' ');
-                    line.extend(piece);
-                }
-                None => lines.push(piece.iter().collect()),
-            }
-        }
-    }
-    lines
-}
-
 impl Plot {
     /// Whether there is anything to draw.
     pub fn is_empty(&self) -> bool {
@@ -237,30 +212,22 @@ impl Plot {
     }
     /// An SVG file with a heading, a legend and the note.
     pub fn file(&self, heading: &str, legend: &[Entry]) -> String {
-        let (above, mut x, mut y) = (24.0, LEFT, 0.0);
-        let mut entries = String::new();
-        for entry in legend {
-            let width = 24.0 + CHARACTER * entry.name.chars().count() as f64;
-            if x > LEFT && x + width > WIDTH {
-                (x, y) = (LEFT, y + LEGEND_LINE);
-            }
-            let (at, colour) = (above + HEIGHT + y + 8.0, entry.colour.map_or("#333", |c| COLOURS[c % COLOURS.len()]));
-            let symbol = match entry.marker {
-                Some(kind) => marker(kind, x + 6.0, at, colour),
-                None => format!("<rect x=\"{x:.1}\" y=\"{:.1}\" width=\"12\" height=\"12\" fill=\"{colour}\"/>", at - 6.0),
-            };
-            _ = write!(entries, "{symbol}<text x=\"{:.1}\" y=\"{:.1}\">{}</text>", x + 17.0, at + 4.0, html(&entry.name));
-            x += width;
+        let headings = wrapped(heading, ((WIDTH - LEFT - MARGIN) / HEADING_CHARACTER) as usize);
+        let above = 24.0 + HEADING_LINE * headings.len().saturating_sub(1) as f64;
+        let mut title = String::new();
+        for (i, line) in headings.iter().enumerate() {
+            _ = write!(title, "<text class=\"title\" x=\"{LEFT}\" y=\"{:.0}\" font-weight=\"600\">{}</text>", 17.0 + HEADING_LINE * i as f64, html(line));
         }
+        let (mut entries, mut y) = drawn(legend, [LEFT, WIDTH], above + HEIGHT + 8.0);
         for line in wrapped(&self.note, ((WIDTH - 2.0 * MARGIN) / CHARACTER) as usize) {
-            y += LEGEND_LINE;
+            y += LINE;
             _ = write!(entries, "<text x=\"{MARGIN}\" y=\"{:.1}\">{}</text>", above + HEIGHT + y + 12.0, html(&line));
         }
-        let height = above + HEIGHT + y + LEGEND_LINE + 4.0;
+        let height = above + HEIGHT + y + LINE + 4.0;
         format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH:.0} {height:.0}\" width=\"{WIDTH:.0}\" height=\"{height:.0}\" role=\"img\">\n<title>{title}</title><style>\n{STYLE}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"#fff\"/><text class=\"title\" x=\"{LEFT}\" y=\"17\" font-weight=\"600\">{title}</text>\n<g transform=\"translate(0 {above})\">{}</g>\n{entries}\n</svg>\n",
-            self.drawing(),
-            title = html(heading)
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH:.0} {height:.0}\" width=\"{WIDTH:.0}\" height=\"{height:.0}\" role=\"img\">\n<title>{}</title><style>\n{STYLE}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>{title}\n<g transform=\"translate(0 {above})\">{}</g>\n{entries}\n</svg>\n",
+            html(heading),
+            self.drawing()
         )
     }
     /// Everything within the axes, and the axes.
@@ -327,14 +294,14 @@ fn draw(svg: &mut String, series: &Series, x: &Scale, y: &Scale) {
     let colour = COLOURS[series.colour % COLOURS.len()];
     if series.line && series.points.len() > 1 {
         let path: Vec<String> = series.points.iter().map(|p| format!("{:.1} {:.1}", x.at(p.x), y.at(p.y))).collect();
-        _ = write!(svg, "<path class=\"line\" stroke=\"{colour}\" d=\"M{}\"/>", path.join("L"));
+        _ = write!(svg, "<path class=\"line\" stroke=\"{colour}\"{} d=\"M{}\"/>", dashes(series.colour), path.join("L"));
     }
     for p in &series.points {
         let (at_x, at_y) = (x.at(p.x), y.at(p.y));
         let range = p.y_range.filter(|(low, high)| high > low);
         let whisker = range.map(|(low, high)| format!("<path class=\"range\" stroke=\"{colour}\" d=\"M{at_x:.1} {:.1}V{:.1}\"/>", y.at(low), y.at(high)));
         if let Some(kind) = series.marker {
-            let shape = marker(kind, at_x, at_y, colour);
+            let shape = marker(kind, at_x, at_y, colour) + &dots(series.colour, at_x, at_y + TO_DOTS);
             _ = write!(svg, "<g><title>{}</title>{}{shape}</g>", html(&p.hint), whisker.unwrap_or_default());
         }
     }
@@ -383,8 +350,21 @@ mod tests {
     }
 
     #[test]
-    fn lines_of_a_note_are_no_longer_than_there_is_room() {
-        assert_eq!(wrapped("one two  three abcdefghij k", 7), ["one two", "three", "abcdefg", "hij k"]);
-        assert!(wrapped(" ", 7).is_empty());
+    fn trainings_of_one_colour_have_other_lines_and_markers() {
+        let plot = |colour: usize, marker: Option<usize>| {
+            let point = |x: f64| Point { x, y: 30.0 + x, y_range: None, hint: String::new() };
+            let series = Series { colour, marker, line: marker.is_none(), points: vec![point(1.0), point(2.0)] };
+            Plot { title: String::new(), x: Axis::linear("x"), y: Axis::linear("y"), series: vec![series], front: Vec::new(), note: String::new() }.figure()
+        };
+        for marker in [None, Some(0)] {
+            assert_ne!(plot(3, marker), plot(3 + COLOURS.len(), marker));
+        }
+    }
+
+    #[test]
+    fn a_long_heading_has_several_lines() {
+        let plot = Plot { title: String::new(), x: Axis::linear("x"), y: Axis::linear("y"), series: Vec::new(), front: Vec::new(), note: String::new() };
+        let headings = |heading: &str| plot.file(heading, &[]).matches("font-weight=\"600\"").count();
+        assert_eq!([headings("short"), headings(&"scene ".repeat(20))], [1, 3]);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::rows::{Better, QUANTITIES, Quantity, Row, TRAINING};
 use super::text;
-use crate::sweep::{TrainingDevices, csv_field, mixture_notes, trained_on};
+use crate::sweep::{TrainingDevices, csv_field, interrupted, kept_out, mixture_notes, trained_on};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
@@ -39,7 +39,8 @@ pub struct Table {
 
 /// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds. The best mean of a column is marked
 /// where means of trainings that did not fail differ in the digits shown; trainings that failed are never the best. Times of trainings that ran on different
-/// devices state these, and none is the best. Notes state why values of these quantities are missing, every reason once.
+/// devices state these, and none is the best. Notes state why values of these quantities are missing, every reason once, which trainings were interrupted, and
+/// which learned from fewer views.
 pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], trained: &TrainingDevices) -> Table {
     let settings = rows.iter().any(|row| row.setting != "base");
     let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
@@ -59,6 +60,7 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
         })
         .collect();
     let (mut notes, mut absent) = (Vec::new(), Vec::new());
+    let named = || rows.iter().map(|row| (row.training(), row.cells.as_slice()));
     for quantity in quantities {
         let spreads: Vec<_> = rows.iter().map(|row| row.spread(quantity)).collect();
         let has_column = spreads.iter().any(Option::is_some);
@@ -84,6 +86,9 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
         if mixed {
             notes.push(trained.sentence());
         }
+        if quantity.key == TRAINING.key {
+            notes.extend(interrupted(named()));
+        }
         for ((line, spread), row) in lines.iter_mut().zip(&spreads).zip(rows) {
             let mark = if mixed { trained.mark(&row.cells) } else { String::new() };
             let text = spread.map_or_else(|| "–".to_string(), |s| s.text(quantity.digits) + &mark);
@@ -91,7 +96,8 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
             line.push(Cell { text, best: is_best });
         }
     }
-    notes.extend(mixture_notes(rows.iter().map(|row| (row.training(), row.cells.as_slice()))));
+    notes.extend(mixture_notes(named()));
+    notes.extend(kept_out(named()));
     let hopeless: Vec<String> = rows
         .iter()
         .filter(|row| row.hopeless())

@@ -166,6 +166,7 @@ fn trainings_that_failed_are_not_on_the_pareto_front() {
     cells[2].outcome = Outcome::Hopeless;
     let failed = plot(&cells);
     assert_eq!((rings(&failed), failed.contains("cdf / cca-low (failed)")), (2, true), "it is shown without a ring");
+    assert!(failed.contains(">cdf (failed)</text>") && failed.contains(">hexplane</text>") && sound.contains(">cdf</text>"), "legends name it");
 }
 
 #[test]

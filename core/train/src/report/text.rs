@@ -21,12 +21,12 @@ fn unprintable(c: char) -> bool {
     c.is_control() || matches!(c, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
-/// For a cell of a Markdown table: characters with a meaning in Markdown or HTML are escaped.
+/// For a cell of a Markdown table: characters with a meaning in Markdown or HTML are escaped, and those that begin a formula on some sites.
 pub fn markdown(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
-            '\\' | '`' | '*' | '_' | '[' | ']' | '|' | '!' | '~' | '#' => {
+            '\\' | '`' | '*' | '_' | '[' | ']' | '|' | '!' | '~' | '#' | '$' => {
                 out.push('\\');
                 out.push(c);
             }
@@ -98,6 +98,7 @@ mod tests {
         let evil = "<script>alert('1')</script> & \"x\" \u{202e}\u{0}";
         assert_eq!(html(evil), "&lt;script&gt;alert(&#39;1&#39;)&lt;/script&gt; &amp; &quot;x&quot; \u{fffd}\u{fffd}");
         assert_eq!(markdown("a|b_c<d>\n"), "a\\|b\\_c&lt;d&gt;\u{fffd}");
+        assert_eq!(markdown("$x_1$"), "\\$x\\_1\\$");
         assert_eq!(latex("a <b> | c"), "a \\textless{}b\\textgreater{} \\textbar{} c");
         assert_eq!(latex("50% of $x_1$ \\input{y}^~é"), "50\\% of \\$x\\_1\\$ \\textbackslash{}input\\{y\\}\\textasciicircum{}\\textasciitilde{}?");
     }

@@ -16,6 +16,8 @@ const INDEX_VARIABLES: [&str; 4] = ["SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID",
 const NOTICE_SECONDS: u32 = 120;
 /// Least time limit of a job of Slurm, minutes. Slurm may give the notice a minute earlier, and a task that is stopped at once is queued again without end.
 const LEAST_SLURM_MINUTES: u32 = 4;
+/// Most tasks of an array of Slurm, whose `MaxArraySize` is 1001 by default: indices are below it.
+const MOST_TASKS: usize = 1001;
 
 /// A scheduler.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -192,8 +194,44 @@ fn extent(plan: &Plan) -> String {
     format!("{trainings} {}, {cells} {}", plural(trainings, "training", "trainings"), plural(cells, "cell", "cells"))
 }
 
+/// What a task of Slurm does: it runs `command` with the index of its training, and `code` is then the exit code. With more than [`MOST_TASKS`] trainings it runs
+/// every so many, one after the other: an error of one does not end the others, and a task that is queued again goes on where it was.
+fn slurm_work(command: &str, trainings: usize) -> String {
+    let one = |index: &str| {
+        format!(
+            r#"{command} --index "${index}" &
+work=$!
+# A signal ends a wait. The last one finds the program ended, and has its exit code.
+while kill -0 "$work" 2>/dev/null; do
+    wait "$work"
+done
+wait "$work"
+code=$?
+"#
+        )
+    };
+    if trainings <= MOST_TASKS {
+        return one("SLURM_ARRAY_TASK_ID");
+    }
+    format!(
+        r#"# Slurm takes {MOST_TASKS} tasks by default (MaxArraySize), so a task has several trainings, one after the other.
+code=0 failed=0
+for ((index = SLURM_ARRAY_TASK_ID; index < {trainings}; index += {MOST_TASKS})); do
+{}if [ "$code" -ne 0 ] && [ "$code" -ne {INTERRUPTED} ]; then failed=$code; fi
+if [ "$notice" ]; then code={INTERRUPTED}; fi
+if [ "$code" -eq {INTERRUPTED} ]; then break; fi
+done
+if [ "$code" -ne {INTERRUPTED} ]; then code=$failed; fi
+"#,
+        one("index")
+    )
+}
+
 fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
-    let last = plan.trainings.len() - 1;
+    let trainings = plan.trainings.len();
+    let last = trainings.min(MOST_TASKS) - 1;
+    let (program, limits, folder) = (quoted(&o.program), limit_options(o), quoted(&o.folder));
+    let command = format!("{program} --quiet --threads {} {limits}sweep run {folder} --plan {}", o.threads, plan.id());
     let throttle = if o.parallel > 0 { format!("%{}", o.parallel) } else { String::new() };
     let output = sbatch_quoted(&format!("{}/slurm-%a.log", folder_of_logs(o).replace('%', "%%")));
     format!(
@@ -216,15 +254,7 @@ set -u
 work= notice=
 trap 'notice=yes; kill -TERM "$work" 2>/dev/null' USR1
 trap : TERM INT
-{program} --quiet --threads {threads} {limits}sweep run {folder} --plan {plan} --index "$SLURM_ARRAY_TASK_ID" &
-work=$!
-# A signal ends a wait. The last one finds the program ended, and has its exit code.
-while kill -0 "$work" 2>/dev/null; do
-    wait "$work"
-done
-wait "$work"
-code=$?
-if [ "$notice" ] && [ "$code" -eq {INTERRUPTED} ]; then
+{work}if [ "$notice" ] && [ "$code" -eq {INTERRUPTED} ]; then
     scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}" || true
 fi
 exit "$code"
@@ -236,10 +266,7 @@ exit "$code"
         minutes = o.minutes,
         variables = variables.iter().map(|(name, value)| format!("export {name}={}\n", quoted(value))).collect::<String>(),
         cd = quoted(&o.working_folder),
-        program = quoted(&o.program),
-        limits = limit_options(o),
-        folder = quoted(&o.folder),
-        plan = plan.id(),
+        work = slurm_work(&command, trainings),
     )
 }
 

@@ -1,5 +1,5 @@
-//! What the trainings of a row differ in beside their seeds. A plan sized in minutes times the machine, and may choose other settings for one seed than for the
-//! next: the deviation of such a row is not that of its seeds alone, and tables say so.
+//! What the trainings of a table differ in beside their seeds. A plan sized in minutes times the machine, and may choose other settings for one seed than for the
+//! next: the deviation of such a row is not that of its seeds alone, and tables say so. They also say which trainings learned from fewer views than others.
 
 use super::result::CellResult;
 use serde_json::Value;
@@ -19,13 +19,28 @@ pub(crate) fn notes<'a>(rows: impl IntoIterator<Item = (String, &'a [&'a CellRes
     rows.into_iter().filter_map(of).collect()
 }
 
-/// The settings that differ, with their values in the order of the results.
+/// A note on those `rows`, each a name and its results, where their trainings kept different numbers of views out (`train.validation`), whatever they are scored
+/// on: some learned from fewer views.
+pub(crate) fn kept_out<'a>(rows: impl IntoIterator<Item = (String, &'a [&'a CellResult])>) -> Option<String> {
+    let views = |result: &&CellResult| result.provenance.configuration.pointer("/train/validation").map_or_else(|| "0".to_string(), ToString::to_string);
+    let mut found: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for (name, row) in rows {
+        found.entry(name).or_default().extend(row.iter().map(views));
+    }
+    let named: Vec<String> = found.iter().map(|(name, own)| format!("{name} {}", own.iter().cloned().collect::<Vec<_>>().join(", "))).collect();
+    let differ = found.values().flatten().collect::<BTreeSet<_>>().len() > 1;
+    let text = "Trainings kept different numbers of views out (train.validation), so some learned from fewer views than others";
+    differ.then(|| format!("{text}: {}.", named.join("; ")))
+}
+
+/// The settings that differ, and the program where that differs, with their values in the order of the results.
 fn differing(row: &[&CellResult]) -> BTreeMap<String, Vec<String>> {
     let settings: Vec<BTreeMap<String, String>> = row
         .iter()
         .map(|result| {
             let mut found = BTreeMap::new();
             flatten("", &result.provenance.configuration, &mut found);
+            found.insert("program".into(), format!("{} ({})", result.provenance.version, result.provenance.commit));
             found
         })
         .collect();
@@ -67,5 +82,26 @@ mod tests {
         let found = notes([("cdf".into(), &[&a, &b, &c][..]), ("cdf".into(), &[&a, &b, &c][..])]);
         assert_eq!(found.len(), 1);
         assert!(found.first().unwrap().ends_with(": train.batch = 1, 2, 1"), "{found:?}");
+        // Another program is another method, too.
+        let mut later = with(3, 1, 5000);
+        later.provenance.commit = "later".into();
+        let found = notes([("cdf".into(), &[&a, &later][..])]);
+        assert!(found.len() == 1 && found.first().unwrap().contains(": program = ") && found.first().unwrap().ends_with(" (later)"), "{found:?}");
+    }
+
+    #[test]
+    fn trainings_with_fewer_views_are_named() {
+        let with = |seed: u64, views: u64| {
+            cell(&format!("{seed}"), |r| {
+                r.axes.seed = seed;
+                r.provenance.configuration = serde_json::json!({ "train": { "validation": views } });
+            })
+        };
+        let (none, twelve) = (with(0, 0), with(0, 12));
+        // Older results do not state the setting.
+        let old = cell("old", |r| r.provenance.configuration = serde_json::json!({}));
+        assert_eq!(kept_out([("cdf".into(), &[&none, &old][..]), ("hexplane".into(), &[&none][..])]), None);
+        let note = kept_out([("cdf".into(), &[&none][..]), ("hexplane".into(), &[&twelve][..]), ("hexplane".into(), &[&twelve][..])]).unwrap();
+        assert!(note.contains("train.validation") && note.ends_with(": cdf 0; hexplane 12."), "{note}");
     }
 }

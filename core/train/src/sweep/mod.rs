@@ -32,7 +32,7 @@ pub use facts::{PeakMemory, device_facts, fingerprint};
 pub use folder::{Failure, SweepFolder};
 pub use grid::{Axis, CodecAxis, Grid, MethodAxis, MethodKeys, SceneAxis, SceneKeys, ScoredViews, SettingAxis, SettingKeys};
 pub use lock::TrainingLock;
-pub(crate) use mixture::notes as mixture_notes;
+pub(crate) use mixture::{kept_out, notes as mixture_notes};
 #[cfg(test)]
 pub(crate) use plan::tests::example as example_plan;
 pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
@@ -44,5 +44,5 @@ pub use result::{
 pub use run::{Busy, TrainingState, run_training, summary};
 pub(crate) use table::csv_field;
 pub use table::{Spread, csv, markdown};
-pub(crate) use trained::{TrainingDevices, trained_on};
+pub(crate) use trained::{TrainingDevices, interrupted, trained_on};
 pub use training::Worker;

@@ -181,8 +181,11 @@ impl Plan {
     /// Writes the plan into the folder of a sweep, in place of an earlier one.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for a folder in a dataset of the plan, and for one with a `plan.json` of another kind; [`Error::Io`].
+    /// [`Error::Parameter`] for a file, for a folder in a dataset of the plan, and for one with a `plan.json` of another kind; [`Error::Io`].
     pub fn write(&self, folder: &Path) -> Result<()> {
+        if folder.is_file() {
+            return Err(Error::parameter(format!("--out {}", folder.display()), "it is a file, and a sweep is a folder", "Give the name of a folder"));
+        }
         for dataset in self.trainings.iter().map(|training| training.data.path.as_str()).collect::<BTreeSet<_>>() {
             if would_be_part(folder, &locate(dataset)?) {
                 let problem = format!("it lies in the dataset {dataset}, which would change with every file of the sweep");

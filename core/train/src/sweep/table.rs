@@ -3,7 +3,7 @@
 use super::mixture;
 use super::read::check_comparable;
 use super::result::{CellResult, Outcome};
-use super::trained::{TrainingDevices, trained_on};
+use super::trained::{TrainingDevices, interrupted, trained_on};
 use cc4dgs_core::{Error, Result, plural};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -139,7 +139,8 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
             cells.push(if hopeless > 0 { format!("{hopeless} hopeless") } else { String::new() });
             let _ = writeln!(text, "| {} |", cells.join(" | "));
         }
-        for note in mixture::notes(of_scene.iter().map(|row| (format!("{} {}", row.axes[1], row.axes[2]), row.results.as_slice()))) {
+        let named = || of_scene.iter().map(|row| (format!("{} {}", row.axes[1], row.axes[2]), row.results.as_slice()));
+        for note in mixture::notes(named()).into_iter().chain(mixture::kept_out(named())).chain(interrupted(named())) {
             let _ = writeln!(text, "\n{note}");
         }
     }
@@ -255,6 +256,19 @@ mod tests {
         // Of the two seeds of one row, one does not say.
         assert!(table.contains("| 180.2 ± 0.0 [2, ?] |") && table.contains("| 180.2 [1] |"), "{table}");
         assert!(csv(&results).unwrap().lines().nth(1).unwrap().ends_with(",flex; Example processor; 8 threads; linux x86_64"));
+    }
+
+    #[test]
+    fn interruptions_and_views_that_were_kept_out_are_stated() {
+        let mut results = two_seeds();
+        let table = markdown(&results).unwrap();
+        assert!(!table.contains("interrupted") && !table.contains("train.validation"), "{table}");
+        results[2].axes.method = "hexplane".into();
+        results[2].cost.resumed = 2;
+        results[2].provenance.configuration = serde_json::json!({ "train": { "validation": 12 } });
+        let table = markdown(&results).unwrap();
+        assert!(table.contains("\n\nTraining times of trainings that were interrupted") && table.contains(": hexplane base (2 interruptions)."), "{table}");
+        assert!(table.contains("; hexplane base 12."), "{table}");
     }
 
     #[test]

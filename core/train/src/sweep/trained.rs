@@ -3,6 +3,7 @@
 
 use super::read::describe;
 use super::result::CellResult;
+use cc4dgs_core::plural;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The devices that the trainings of some results ran on, each numbered by its index.
@@ -68,6 +69,20 @@ pub(crate) fn trained_on(row: &[&CellResult]) -> String {
     of_row(row).into_iter().map(|device| device.replace(", ", "; ")).collect::<Vec<_>>().join(" + ")
 }
 
+/// A sentence on those `rows`, each the name of a training and its results, that went on after an interruption, and how often; `None` where none did.
+pub(crate) fn interrupted<'a>(rows: impl IntoIterator<Item = (String, &'a [&'a CellResult])>) -> Option<String> {
+    let mut found: BTreeMap<String, usize> = BTreeMap::new();
+    for (name, row) in rows {
+        // Rows of several codecs share their trainings.
+        let own: usize = row.iter().map(|result| result.cost.resumed).sum();
+        let most = found.entry(name).or_default();
+        *most = own.max(*most);
+    }
+    found.retain(|_, times| *times > 0);
+    let named: Vec<String> = found.iter().map(|(name, times)| format!("{name} ({times} {})", plural(*times, "interruption", "interruptions"))).collect();
+    (!named.is_empty()).then(|| format!("Training times of trainings that were interrupted include the work that was repeated: {}.", named.join("; ")))
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::read::tests::{cell, example};
@@ -94,5 +109,19 @@ mod tests {
         assert_eq!(trained_on(&[&results[0]]), "flex; Example processor; 1 thread; linux x86_64");
         assert_eq!(trained_on(&[&results[1]]).split(" + ").count(), 2);
         assert_eq!(trained_on(&[&results[2]]), "");
+    }
+
+    #[test]
+    fn trainings_that_were_interrupted_are_named() {
+        let (whole, once, twice) = (example(), cell("once", |r| r.cost.resumed = 1), cell("twice", |r| r.cost.resumed = 2));
+        assert_eq!(interrupted([("cdf".into(), &[&whole][..])]), None);
+        let said = interrupted([
+            ("cdf".into(), &[&whole, &once][..]),
+            ("cdf".into(), &[&once][..]),
+            ("grid4d".into(), &[&whole][..]),
+            ("hexplane".into(), &[&once, &twice][..]),
+        ])
+        .unwrap();
+        assert!(said.ends_with(": cdf (1 interruption); hexplane (3 interruptions)."), "{said}");
     }
 }

@@ -27,6 +27,11 @@ fn lines_join_the_rates_of_one_codec_alone() {
         lines_with(&|c| (c.axes.setting, c.axes.codec, c.provenance.codec) = ("wide".into(), other.axes.codec.clone(), other.provenance.codec.clone()))
     };
     assert_eq!(settings(&cells[0]), 2, "settings of each method, stored by one codec");
+    let failed = lines_with(&|c| {
+        (c.axes.setting, c.axes.codec, c.provenance.codec) = ("wide".into(), cells[0].axes.codec.clone(), cells[0].provenance.codec.clone());
+        c.outcome = Outcome::Hopeless;
+    });
+    assert_eq!(failed, 0, "trainings that failed are no point of a line of settings");
     // The codec of the Gaussians and the weight codec of each training's files, the larger one first.
     let lines_of = |larger: [&str; 2], smaller: [&str; 2]| {
         let mut cells = cells.clone();
@@ -52,6 +57,31 @@ fn trainings_have_all_their_seeds_where_a_codec_lacks_some() {
     cells.remove(1);
     let svg = figure(folder.path(), &cells, name).unwrap();
     assert_eq!(svg.matches("class=\"line\"").count(), 4, "two methods with two seeds");
+}
+
+#[test]
+fn times_of_interrupted_trainings_and_views_that_were_kept_out_are_stated() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    let options = ReportOptions { columns: ["training_minutes", "psnr_db"].map(String::from).to_vec(), images: ImageChoice::None, ..Default::default() };
+    let make = |cells: &[CellResult]| {
+        write(folder.path(), cells);
+        report(folder.path(), &options).unwrap()
+    };
+    let whole = make(&cells);
+    assert!(!whole.markdown.contains("interrupted") && !whole.markdown.contains("train.validation"), "{}", whole.markdown);
+    // One seed of a training, which all codecs share.
+    for cell in cells.iter_mut().filter(|c| c.axes.method == "cdf") {
+        cell.cost.resumed = (2 * cell.axes.seed) as usize;
+        cell.provenance.configuration["train"]["validation"] = 12.into();
+    }
+    let made = make(&cells);
+    let said = "Training times of trainings that were interrupted include the work that was repeated: cdf (2 interruptions).";
+    assert_eq!(made.markdown.matches(said).count(), 1, "{}", made.markdown);
+    assert!(made.markdown.contains("fewer views than others: cdf 12; hexplane "), "{}", made.markdown);
+    let names: Vec<&str> = made.figures.iter().filter(|(_, svg)| svg.contains("2 interruptions")).map(|(name, _)| name.as_str()).collect();
+    assert!(names.contains(&"tiny-psnr-against-training-time.svg") && names.contains(&"tiny-training-views-by-time-a-line-per-seed.svg"), "{names:?}");
+    assert!(names.iter().all(|name| name.contains("time")), "{names:?}");
 }
 
 #[test]

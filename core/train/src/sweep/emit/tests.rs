@@ -300,6 +300,53 @@ fn the_slurm_script_is_bash_and_requeues_what_was_asked_to_stop_before_its_limit
     }
 }
 
+/// Slurm refuses arrays with more tasks than its `MaxArraySize`, so a task of a large plan has several trainings.
+#[cfg(unix)]
+#[test]
+fn arrays_of_slurm_are_no_larger_than_it_takes() {
+    use std::os::unix::fs::PermissionsExt;
+    use std::process::Command;
+    let with = |trainings: usize| {
+        let mut large = plan();
+        large.trainings = vec![large.trainings[0].clone(); trainings];
+        large
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let program = |name: &str, text: &str| {
+        std::fs::write(at(name), format!("#!/bin/bash\n{text}\n")).unwrap();
+        std::fs::set_permissions(at(name), std::fs::Permissions::from_mode(0o755)).unwrap();
+    };
+    let options = EmitOptions { program: at("program").display().to_string(), working_folder: folder.path().display().to_string(), ..options() };
+    let script = |trainings: usize| emit(Scheduler::Slurm, &with(trainings), &options).unwrap();
+    for (trainings, array) in [(1001, "--array=0-1000\n"), (1002, "--array=0-1000\n"), (7, "--array=0-6\n")] {
+        assert!(script(trainings).contains(array), "{trainings}");
+    }
+    program("scontrol", &format!("echo \"$@\" >> {}", at("requeued").display()));
+    let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap_or_default());
+    std::fs::write(at("array.sh"), script(2500)).unwrap();
+    let interrupted = i32::from(INTERRUPTED);
+    // The last argument is the index.
+    let notice = format!("trap 'exit {interrupted}' TERM; kill -USR1 $PPID; for _ in $(seq 200); do sleep 0.05; done; exit 1");
+    for (task, end, code, indices, requeued) in [
+        ("3", "exit 0", 0, "3\n1004\n2005\n", ""),
+        ("999", "exit 0", 0, "999\n2000\n", ""),
+        ("3", "[ \"${!#}\" = 1004 ] && exit 6; exit 0", 6, "3\n1004\n2005\n", ""),
+        ("3", notice.as_str(), interrupted, "3\n", "requeue 7_3\n"),
+        // Cancelled: the program was asked to stop by Slurm itself.
+        ("3", "exit 130", interrupted, "3\n", ""),
+    ] {
+        std::fs::remove_file(at("requeued")).ok();
+        std::fs::remove_file(at("indices")).ok();
+        program("program", &format!("echo \"${{!#}}\" >> {}\n{end}", at("indices").display()));
+        let status =
+            Command::new("bash").arg(at("array.sh")).env("PATH", &path).env("SLURM_ARRAY_JOB_ID", "7").env("SLURM_ARRAY_TASK_ID", task).status().unwrap();
+        assert_eq!(status.code(), Some(code), "{end}");
+        assert_eq!(std::fs::read_to_string(at("indices")).unwrap(), indices, "{end}");
+        assert_eq!(std::fs::read_to_string(at("requeued")).unwrap_or_default(), requeued, "{end}");
+    }
+}
+
 #[test]
 fn what_cannot_be_written_is_refused() {
     let empty = Plan { trainings: Vec::new(), ..plan() };

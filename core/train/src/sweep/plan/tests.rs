@@ -167,6 +167,8 @@ fn a_plan_replaces_plans_only_and_lies_in_no_dataset() {
     let message = plan.write(&out).unwrap_err().to_string();
     assert!(message.contains("plan.json") && message.contains("not the plan of a sweep"), "{message}");
     assert_eq!(std::fs::read_to_string(out.join(PLAN)).unwrap(), "{\"name\": \"mine\"}");
+    let message = plan.write(&out.join(PLAN)).unwrap_err().to_string();
+    assert!(message.contains("--out") && message.contains("it is a file") && message.contains("name of a folder"), "{message}");
     // A training begins when the files of its dataset are those of the plan.
     plan.trainings[0].data.path = folder.path().display().to_string();
     let inner = folder.path().join("runs/a");
