@@ -2,6 +2,7 @@
 
 mod bench;
 mod files;
+mod numbers;
 mod play;
 mod prune;
 mod sweep;
@@ -17,6 +18,7 @@ pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRu
 use cc4dgs::video::RATES;
 use cc4dgs_play::OrbitViews;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use numbers::{parse_minutes, parse_threads};
 use std::path::PathBuf;
 
 const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 backend, 6 a training that failed, 130 interrupted. Sizes are in MB = 10^6 bytes.";
@@ -31,8 +33,8 @@ pub struct Cli {
     /// Print results and errors only.
     #[arg(long, short, global = true)]
     pub quiet: bool,
-    /// Threads to compute with; 0 uses all cores. Plans of the preset auto depend on it, other results do not.
-    #[arg(long, global = true, value_name = "N", default_value_t = 0)]
+    /// Threads to compute with, at most 1024; 0 uses all cores. Plans of the preset auto depend on it, other results do not.
+    #[arg(long, global = true, value_name = "N", default_value_t = 0, value_parser = parse_threads)]
     pub threads: usize,
     /// Raise or lower what readers accept of a file: max_bytes, max_gaussians, max_pixels or max_depth, such as max_gaussians=50000000; may be given several times.
     #[arg(long = "limit", global = true, value_name = "NAME=VALUE")]
@@ -106,7 +108,7 @@ pub struct Train {
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Wall time in minutes that the preset `auto` plans for; by default ten on processors and five on a graphics card.
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = parse_minutes, allow_negative_numbers = true)]
     pub minutes: Option<f64>,
     /// A TOML file laid over the preset.
     #[arg(long, value_name = "FILE")]
@@ -217,7 +219,7 @@ pub struct Report {
     /// The folder of a sweep, a folder of results, or one file of them.
     #[arg(value_name = "DIR")]
     pub results: PathBuf,
-    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default. Only files of earlier reports are replaced.
+    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default, of a file the .html beside it. Only files of earlier reports are replaced.
     #[arg(long, value_name = "FILE.html")]
     pub out: Option<PathBuf>,
     /// Heading of the page.

@@ -1,6 +1,6 @@
 //! Results go to standard output (for people, or as JSON), everything else to standard error.
 
-use crate::commands::create_parent;
+use crate::commands::{check_writable, create_parent};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Result};
@@ -15,6 +15,20 @@ const MARK: &str = "cc4dgs";
 /// The description of files for which [`is_result`] is true, for errors.
 const RESULT: &str = "a result that --json wrote";
 
+/// Names of standard output. It may be a file, which must be neither removed nor replaced while it is written to.
+const STDOUT: [&str; 3] = ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"];
+
+/// Whether `file` names an open file, such as that of `3> out.json`, which is written to and not replaced.
+fn is_descriptor(file: &Path) -> bool {
+    cfg!(unix) && (file == Path::new("/dev/stderr") || file.starts_with("/dev/fd") || file.starts_with("/proc")) && file.exists()
+}
+
+/// Writes `json` into the open file that `descriptor` names, in place of what it holds.
+fn write_through(descriptor: &Path, json: &str) -> Result<()> {
+    let opened = std::fs::OpenOptions::new().write(true).truncate(true).open(descriptor);
+    opened.and_then(|mut file| file.write_all(json.as_bytes())).map_err(|e| Error::io(descriptor, e))
+}
+
 /// Where results go.
 pub struct Output {
     json: Option<PathBuf>,
@@ -24,7 +38,10 @@ pub struct Output {
 }
 
 impl Output {
+    /// `json` is the file that `--json` names, `-` or another name of standard output.
     pub fn new(json: Option<PathBuf>, quiet: bool) -> Self {
+        let is_stdout = |file: &Path| cfg!(unix) && STDOUT.iter().any(|name| file == Path::new(name));
+        let json = json.map(|file| if is_stdout(&file) { "-".into() } else { file });
         Self { json, quiet, printed: AtomicBool::new(false) }
     }
     /// Whether progress is unwanted.
@@ -35,11 +52,19 @@ impl Output {
     pub fn json_file(&self) -> Option<&Path> {
         self.json.as_deref().filter(|p| p.as_os_str() != "-")
     }
-    /// Refuses a file for the JSON that exists and is no result of this program, and removes an earlier result, so that it is not taken for the result of a
-    /// command that fails. Call it before any work.
+    /// The file `--json` names, if other files may lie beside it: it is no device, no pipe and no open file.
+    pub fn json_beside(&self) -> Option<&Path> {
+        self.json_file().filter(|file| !is_descriptor(file) && file.metadata().map_or(true, |found| found.is_file()))
+    }
+    /// Refuses a file for the JSON that cannot be written, and one that exists and is no result of this program, and removes an earlier result, so that it is not
+    /// taken for the result of a command that fails. Call it before any work.
     pub fn begin(&self) -> Result<()> {
         let Some(file) = self.json_file() else { return Ok(()) };
         refuse_other_content(file, RESULT, is_result)?;
+        if is_descriptor(file) {
+            return Ok(());
+        }
+        check_writable(file)?;
         // A link stays, and leads to nothing until the result is written; devices and pipes stay, too.
         match file.canonicalize() {
             Ok(earlier) if earlier.is_file() => std::fs::remove_file(&earlier).map_err(|e| Error::io(&earlier, e)),
@@ -74,7 +99,10 @@ impl Output {
                 }
                 // The command itself may have made a file of this name meanwhile, such as the plan of a sweep.
                 let free = refuse_other_content(path, RESULT, is_result);
-                let written = free.and(json).and_then(|json| create_parent(path).and_then(|()| write_atomically(path, json.as_bytes())));
+                let written = free.and(json).and_then(|json| match is_descriptor(path) {
+                    true => write_through(path, &json),
+                    false => create_parent(path).and_then(|()| write_atomically(path, json.as_bytes())),
+                });
                 // What was measured is shown where its file cannot be written, too.
                 print(&text())?;
                 written
@@ -134,6 +162,39 @@ mod tests {
         };
         assert!(Output::new(Some(no_folder.join("out.json")), true).result(&serde_json::json!({ "psnr_db": 30.5 }), text).is_err());
         assert!(shown);
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_refused_before_the_work() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        std::fs::write(&file, "mine").unwrap();
+        let begin = |file: &Path| Output::new(Some(file.to_path_buf()), true).begin();
+        assert!(begin(&file.join("out.json")).is_err() && begin(&folder.path().join("new/")).is_err());
+        begin(&folder.path().join("deep/er/out.json")).unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is created");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn open_files_are_written_to_and_not_replaced() {
+        use std::os::fd::AsRawFd;
+        for name in STDOUT {
+            assert_eq!(Output::new(Some(name.into()), true).json.as_deref(), Some(Path::new("-")));
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("out.json");
+        let open = std::fs::File::create(&path).unwrap();
+        let output = Output::new(Some(format!("/dev/fd/{}", open.as_raw_fd()).into()), true);
+        output.begin().unwrap();
+        assert!(path.is_file(), "an open file stays");
+        output.result(&serde_json::json!({ "cells": 2 }), String::new).unwrap();
+        assert!(std::fs::read_to_string(&path).unwrap().contains("\"cells\": 2"));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no file of another name appears");
+        // A contact sheet lies beside files alone.
+        assert_eq!((output.json_beside(), Output::new(Some("/dev/null".into()), true).json_beside()), (None, None));
+        assert_eq!(Output::new(Some(path.clone()), true).json_beside(), Some(path.as_path()));
+        assert_eq!(Output::new(Some("new.json".into()), true).json_beside(), Some(Path::new("new.json")));
     }
 
     #[test]

@@ -14,6 +14,8 @@ fn synthetic_scenes_become_archives_that_play() {
     let small =
         ["bench", "frame", "--scale", "0.001", "--frames", "1", "--device", "flex", "--set", "deformer.kind=cdf-basis", "-q", "--archive", text(&archive)];
     assert!(fail(&small, 2).contains("--case"));
+    let still = fail(&[&small[..], &["--case", "n3dv", "--motion", "0.05", "--set", "deformer.kind=none"]].concat(), 2);
+    assert!(still.contains("--motion 0.05: it has no effect") && !archive.exists(), "{still}");
     succeed(&[&small[..], &["--case", "n3dv", "--motion", "0.05"]].concat());
     let info = json_of(&["info", text(&archive), "--json"]);
     assert_eq!(info["manifest"]["gaussian_count"], 335, "{info}");

@@ -19,7 +19,7 @@ pub struct Decompress {
     #[arg(long)]
     pub no_dynamic: bool,
     /// The Gaussians as deformed at this time (0 to 1) instead of the canonical ones.
-    #[arg(long, value_name = "T")]
+    #[arg(long, value_name = "T", allow_negative_numbers = true)]
     pub time: Option<f32>,
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
@@ -66,8 +66,8 @@ pub struct Shots {
     /// Image size in pixels; by default 800x600 for an orbit, for datasets their own.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<(u32, u32)>,
-    /// Full turns of the orbit while time runs from 0 to 1 [default: 1].
-    #[arg(long, value_name = "TURNS", conflicts_with = "scene")]
+    /// Full turns of the orbit while time runs from 0 to 1; negative ones go the other way [default: 1].
+    #[arg(long, value_name = "TURNS", conflicts_with = "scene", allow_negative_numbers = true)]
     pub turns: Option<f64>,
     /// The axis of the world that points up, for an orbit, for gltf, and for a page in place of what the model states [default: z].
     #[arg(long, value_enum, allow_hyphen_values = true)]
@@ -111,7 +111,7 @@ pub struct Export {
     #[arg(long)]
     pub overwrite: bool,
     /// The instant (0 to 1) that formats without motion hold; without it, the canonical Gaussians. Formats with motion refuse it.
-    #[arg(long, value_name = "T")]
+    #[arg(long, value_name = "T", allow_negative_numbers = true)]
     pub time: Option<f32>,
     /// Override a setting of the exporter (palette=8192), or with --scene a scene option (scene.width=800); may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]

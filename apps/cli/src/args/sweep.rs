@@ -1,5 +1,6 @@
 //! The options of `cc4dgs sweep`.
 
+use super::numbers::parse_minutes;
 use clap::{Args, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -30,7 +31,7 @@ pub struct SweepPlan {
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Size: wall minutes of a training, in place of the grid's.
-    #[arg(long, value_name = "M", conflicts_with = "iterations")]
+    #[arg(long, value_name = "M", conflicts_with = "iterations", value_parser = parse_minutes, allow_negative_numbers = true)]
     pub minutes: Option<f64>,
     /// Size: iterations of a training, in place of the grid's.
     #[arg(long, value_name = "N")]

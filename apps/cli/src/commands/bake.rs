@@ -1,12 +1,11 @@
 //! `cc4dgs bake`.
 
-use super::{Context, create_parent, megabytes};
+use super::{Context, check_file, create_parent, megabytes};
 use crate::args::Bake;
 use crate::interrupt;
 use crate::shots::capture_cameras;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_core::archive::{Archive, Presentation, StreamKind, write_atomically};
-use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Camera, Error, Event, EventSink, Registry, Result, parse_device, toml};
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::bake::{BakeReport, MaxError};
@@ -35,7 +34,7 @@ struct Report {
 
 pub fn run(context: &Context, args: &Bake) -> Result<()> {
     let began = Instant::now();
-    refuse_existing(&args.out, args.overwrite)?;
+    check_file(&args.out, args.overwrite)?;
     let max_error: MaxError = args.max_error.parse()?;
     if let Some(rate) = args.fps.filter(|rate| !RATES.contains(rate)) {
         return Err(Error::parameter("--fps", format!("{rate} frames per second"), format!("Choose {} to {}", RATES.start(), RATES.end())));

@@ -1,12 +1,11 @@
 //! `cc4dgs compress`.
 
-use super::{Context, create_parent, megabytes};
+use super::{Context, check_file, create_parent, megabytes};
 use crate::args::{COMPRESS_CODEC, COMPRESS_WEIGHTS, Compress};
 use crate::ignored::{Stated, refuse_ignored};
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, Presentation, StreamInfo, StreamKind, write_atomically};
-use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{
     CodecPlugin, Error, Event, EventSink, Plugin, PluginEntry, Registry, Result, TuneModel, WeightCodecPlugin, config, read_gaussians, read_weights,
 };
@@ -84,7 +83,7 @@ impl EventSink for Warnings<'_> {
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
-    refuse_existing(&args.out, args.overwrite)?;
+    check_file(&args.out, args.overwrite)?;
     let mut settings = toml::Table::new();
     let (scene_sets, codec_sets): (Vec<String>, Vec<String>) = args.sets.iter().cloned().partition(|set| set.starts_with("scene."));
     if args.scene.is_none() && !scene_sets.is_empty() {

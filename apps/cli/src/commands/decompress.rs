@@ -1,6 +1,6 @@
 //! `cc4dgs decompress`: `export ply` or `export spz`, by the ending of the file.
 
-use super::{Context, export};
+use super::{Context, check_writable, export};
 use crate::args::Decompress;
 use crate::interrupt;
 use crate::models::load_model;
@@ -21,6 +21,7 @@ pub fn run(context: &Context, args: &Decompress) -> Result<()> {
     let plugin = context.registry.exporter(format)?;
     check_time(&context.registry, plugin, args.time)?;
     check_target(&args.out, plugin.target, args.overwrite)?;
+    check_writable(&args.out)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     export::finish(

@@ -1,6 +1,6 @@
 //! `cc4dgs eval`.
 
-use super::{Context, image_folder, lies_in};
+use super::{Context, check_writable, image_folder, lies_in};
 use crate::args::Eval;
 use crate::interrupt;
 use crate::models::{Loaded, load_model};
@@ -72,7 +72,7 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
         return Err(Error::parameter(format!("--sheet {}", sheet.display()), "--sheet-rows 0 draws no contact sheet", "Leave one of the two out"));
     }
     let split = args.views.split.into();
-    let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
+    let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_beside()));
     let images = Images { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
     if let Some(sheet) = &images.sheet {
         check_sheet(sheet, &args.views.scene, args.overwrite)?;
@@ -99,21 +99,25 @@ fn default_sheet(model: &Path, split: Split, json_file: Option<&Path>) -> PathBu
         Split::Validation => "validation",
         Split::Test => "test",
     };
-    match json_file {
-        Some(file) => file.with_extension("png"),
-        None if model.is_dir() => model.join(format!("eval-{side}.png")),
-        None => model.with_extension(format!("{side}.png")),
+    match json_file.map(|file| (file, file.with_extension("png"))) {
+        Some((file, sheet)) if sheet != file => sheet,
+        _ if model.is_dir() => model.join(format!("eval-{side}.png")),
+        _ => model.with_extension(format!("{side}.png")),
     }
 }
 
-/// Refuses to replace a file that is no PNG image by a contact sheet, and a file in the folder of the scene, which may be one of its images.
+/// Refuses to replace a file that is no PNG image by a contact sheet, and a file in the folder of the scene, which may be one of its images. A sheet that cannot be
+/// written is refused, too: the numbers would be measured first.
 fn check_sheet(sheet: &Path, scene: &Path, overwrite: bool) -> Result<()> {
     refuse_other_content(sheet, "a PNG image", |head| head.starts_with(PNG))?;
     if !overwrite && lies_in(sheet, scene) {
         let problem = format!("{} exists already in the folder of the scene, and may be one of its images", sheet.display());
         return Err(Error::parameter("--sheet", problem, "Name another file, or add --overwrite to replace this one"));
     }
-    Ok(())
+    check_writable(sheet).map_err(|e| {
+        let remedy = "Name a file in another folder (--sheet F.png), or draw no contact sheet (--sheet-rows 0)";
+        Error::data(format!("contact sheet {}", sheet.display()), format!("it cannot be written: {e}"), remedy)
+    })
 }
 
 /// The renders that an earlier command left in `folder`. A folder that holds anything is refused without `overwrite`; with it, one that holds anything else, and
@@ -294,6 +298,18 @@ mod tests {
             check("scene/images/00000.png", scene, true).unwrap();
         }
         check("scene/images/00000.png", "procedural:tiny", false).unwrap();
+        // Nobody may write below a file.
+        let message = check("model.cc4d/sheet.png", "scene", false).unwrap_err();
+        assert!(message.contains("model.cc4d/sheet.png") && message.contains("--sheet-rows 0"), "{message}");
+    }
+
+    #[test]
+    fn a_sheet_is_not_the_json_file() {
+        let sheet = |json: Option<&str>| default_sheet(Path::new("runs/a.cc4d"), Split::Test, json.map(Path::new));
+        assert_eq!(sheet(Some("out/eval.json")), Path::new("out/eval.png"));
+        for json in [None, Some("eval.png")] {
+            assert_eq!(sheet(json), Path::new("runs/a.test.png"));
+        }
     }
 
     #[test]

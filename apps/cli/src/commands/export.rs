@@ -1,6 +1,6 @@
 //! `cc4dgs export`.
 
-use super::Context;
+use super::{Context, check_writable};
 use crate::args::Export;
 use crate::ignored::{Stated, refuse_ignored, written};
 use crate::models::load_model;
@@ -23,6 +23,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     shots::check_sets(&args.shots, &scene_sets)?;
     check_time(&context.registry, plugin, args.time)?;
     check_target(&args.out, plugin.target, args.overwrite)?;
+    check_writable(&args.out)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let images = plugin.info.capabilities.contains(&"images");

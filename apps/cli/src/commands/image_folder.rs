@@ -11,8 +11,11 @@ const MARK_TEXT: &str = "cc4dgs wrote the images of this folder; its commands re
 
 /// What `folder` holds besides the mark, by name; nothing where there is no such folder.
 ///
-/// Errors: [`Error::Io`].
+/// Errors: [`Error::Parameter`] for a file, [`Error::Io`].
 pub fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
+    if folder.is_file() {
+        return Err(Error::parameter(folder.display().to_string(), "it is a file, and images are written into a folder", "Give the name of a folder"));
+    }
     if folder.symlink_metadata().is_err() {
         return Ok(Vec::new());
     }
@@ -61,6 +64,8 @@ mod tests {
         refuse_unmarked("--out", &new).unwrap();
         let message = refuse_unmarked("--out", &used).unwrap_err().to_string();
         assert!(["used", "Name another folder", "remove them"].iter().all(|part| message.contains(part)), "{message}");
+        let message = entries(&used.join("photo.png")).unwrap_err().to_string();
+        assert!(["photo.png", "it is a file", "Give the name of a folder"].iter().all(|part| message.contains(part)), "{message}");
         // A folder that is marked stays so, and loses the images of the earlier command alone.
         ["0.png", "1.png"].iter().for_each(|name| std::fs::write(new.join(name), "").unwrap());
         begin(&new, &[new.join("0.png")]).unwrap();

@@ -34,6 +34,8 @@ mod watch;
 use crate::args::{BenchWhat, Cli, Command, SweepWhat};
 use crate::listeners::Progress;
 use crate::output::Output;
+use cc4dgs::runs::check_writable as check_folder_writable;
+use cc4dgs_core::archive::behind_links;
 use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, EventSink, Fanout, Limits, Registry, Result, config};
 use cc4dgs_train::event_log::JsonLines;
@@ -69,9 +71,10 @@ const STACK: usize = 8 << 20;
 /// step would wake the pool's threads and wait for them.
 pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
     // Where the pool already runs (a program calling `run` twice), it stays as it is: results do not depend on it.
-    rayon::ThreadPoolBuilder::new().num_threads(cli.threads.min(1024)).stack_size(STACK).build_global().ok();
+    rayon::ThreadPoolBuilder::new().num_threads(cli.threads).stack_size(STACK).build_global().ok();
     #[cfg(feature = "view")]
     if let Command::View(args) = &cli.command {
+        view_command::refuse_json(cli.json.as_deref())?;
         // The window belongs on the main thread.
         let opened = rayon::scope(|_| view::prepare(&context(cli, output)?, args))?;
         return view::show(args, limits(&cli.limits)?, opened);
@@ -136,6 +139,9 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
 }
 
 fn limits(options: &[String]) -> Result<Limits> {
+    if let Some(option) = options.iter().find(|option| !option.contains('=')) {
+        return Err(Error::parameter(format!("--limit {option}"), "no '=' found", "Write --limit NAME=VALUE, such as --limit max_gaussians=50000000"));
+    }
     let mut table = toml::Table::new();
     config::set_all(&mut table, options)?;
     config::parse_section("--limit", &table)
@@ -146,6 +152,27 @@ fn limits(options: &[String]) -> Result<Limits> {
 fn no_window(command: String) -> Error {
     let remedy = "Build with the feature `view`: cargo run --release -p cc4dgs-cli --features view -- view MODEL (or train --view ...)";
     Error::unsupported(command, "the window is left out of this build", remedy)
+}
+
+/// Refuses a file `path` that exists, unless it may be replaced, that of a folder, and one that cannot be written, before any long work that would be lost. Nothing
+/// is created.
+///
+/// # Errors
+/// Those of [`refuse_existing`] and of [`check_writable`].
+pub fn check_file(path: &Path, overwrite: bool) -> Result<()> {
+    refuse_existing(path, overwrite)?;
+    check_writable(path)
+}
+
+/// Refuses a file `path` whose folder, or the nearest one of those around it that exists, cannot be written. Devices and pipes need no folder.
+///
+/// # Errors
+/// [`Error::Io`] that names the folder.
+pub fn check_writable(path: &Path) -> Result<()> {
+    if path.metadata().is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        return Ok(());
+    }
+    check_folder_writable(behind_links(path)?.parent().unwrap_or(Path::new("")))
 }
 
 /// Creates the folder of the file `path`, and refuses a `path` that is a folder, before any long work that would be lost.
@@ -179,6 +206,8 @@ mod tests {
         for bad in ["max_gausians=7", "max_bytes=-1", "max_bytes"] {
             assert!(limits(&[bad.into()]).is_err(), "{bad}");
         }
+        let message = limits(&["max_bytes".into()]).unwrap_err().to_string();
+        assert!(message.starts_with("--limit max_bytes: ") && !message.contains("--set"), "{message}");
     }
 
     #[test]
@@ -187,5 +216,26 @@ mod tests {
         assert!(create_parent(folder.path()).unwrap_err().to_string().contains("it is a folder"));
         create_parent(&folder.path().join("new/model.cc4d")).unwrap();
         assert!(folder.path().join("new").is_dir());
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_refused_before_the_work() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("mine"), "").unwrap();
+        check_file(&at("deep/er/model.cc4d"), false).unwrap();
+        assert!(!at("deep").exists(), "nothing is created");
+        assert!(check_file(&at("mine"), false).unwrap_err().to_string().contains("--overwrite"));
+        check_file(&at("mine"), true).unwrap();
+        assert!(check_file(&at("new/"), true).unwrap_err().to_string().contains("ends with a separator"));
+        // Unlike missing permissions, a file in place of a folder stops administrators, too.
+        let message = check_file(&at("mine/deep/model.cc4d"), true).unwrap_err().to_string();
+        assert!(message.contains("mine: "), "{message}");
+        #[cfg(unix)]
+        {
+            check_writable(Path::new("/dev/null")).unwrap();
+            std::os::unix::fs::symlink("mine/model.cc4d", at("link")).unwrap();
+            assert!(check_file(&at("link"), true).is_err(), "the folder behind the link counts");
+        }
     }
 }

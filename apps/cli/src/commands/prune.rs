@@ -1,13 +1,12 @@
 //! `cc4dgs prune`.
 
 use super::compress::{compress, say_what_is_lost};
-use super::{Context, create_parent};
+use super::{Context, check_file, create_parent};
 use crate::args::Prune;
 use crate::interrupt;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::Result;
-use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::prune::{PruneReport, prune};
 use cc4dgs_train::train::{RefitJob, prune_and_refit};
@@ -28,7 +27,7 @@ struct Report {
 
 pub fn run(context: &Context, args: &Prune) -> Result<()> {
     let began = Instant::now();
-    refuse_existing(&args.out, args.overwrite)?;
+    check_file(&args.out, args.overwrite)?;
     let events = context.listeners(None)?;
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;

@@ -1,12 +1,11 @@
 //! `cc4dgs render`.
 
-use super::{Context, create_parent, image_folder};
+use super::{Context, check_file, create_parent, image_folder};
 use crate::args::Render;
 use crate::ignored::{Stated, refuse_ignored};
 use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::video::{self, VideoWriter};
-use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, Event, EventSink, Result, plural};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::images::write_png;
@@ -33,8 +32,8 @@ struct Timing {
 pub fn run(context: &Context, args: &Render) -> Result<()> {
     if let Some(path) = &args.mp4 {
         // Before any frame: an hour of rendering should not end in a missing program.
+        check_video(path, args.overwrite)?;
         video::ffmpeg_version()?;
-        refuse_existing(path, args.overwrite)?;
     }
     let (value, remedy) = (args.shots.fps.map(|rate| rate.to_string()), "Leave it out, or add --mp4 F.mp4".into());
     refuse_ignored("frames without a video", [Stated { option: "--fps", value, used: args.mp4.is_some(), remedy }])?;
@@ -89,6 +88,15 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     })
 }
 
+/// Refuses a `video` by whose ending other programs take it for another format, and one that cannot be written.
+fn check_video(video: &Path, overwrite: bool) -> Result<()> {
+    if video.extension().is_none_or(|ending| !ending.eq_ignore_ascii_case("mp4")) {
+        let remedy = format!("Name it {}", video.with_extension("mp4").display());
+        return Err(Error::parameter(format!("--mp4 {}", video.display()), "the video is an MP4 file, whose name ends in .mp4", remedy));
+    }
+    check_file(video, overwrite)
+}
+
 /// The frames that an earlier command left in `folder`, by their names. They are refused without `overwrite`; with it, where no command marked the folder: they
 /// may be images of a dataset.
 fn earlier_frames(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
@@ -107,6 +115,18 @@ fn earlier_frames(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn videos_are_named_as_what_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let check = |name: &str| check_video(&folder.path().join(name), false).map_err(|e| e.to_string());
+        assert_eq!((check("a.mp4"), check("new/a.MP4")), (Ok(()), Ok(())));
+        for name in ["a.avi", "a"] {
+            let message = check(name).unwrap_err();
+            assert!(message.contains("--mp4") && message.contains(name) && message.contains("a.mp4"), "{message}");
+        }
+        assert!(check("a.mp4/").unwrap_err().contains("ends with a separator"));
+    }
 
     #[test]
     fn frames_replace_frames_only() {

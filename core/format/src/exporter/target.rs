@@ -59,8 +59,8 @@ pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn Ex
     Ok((exported, bytes))
 }
 
-/// Refuses a `path` to which a file cannot be written: that of a folder, and one that exists, unless it may be replaced. A link that leads nowhere exists, too.
-/// Call it before long work.
+/// Refuses a `path` to which a file cannot be written: that of a folder, also by a separator at its end, and one that exists, unless it may be replaced. A link
+/// that leads nowhere exists, too. Call it before long work.
 ///
 /// # Errors
 /// [`Error::Parameter`].
@@ -68,7 +68,21 @@ pub fn refuse_existing(path: &Path, overwrite: bool) -> Result<()> {
     if path.is_dir() {
         return Err(Error::parameter(path.display().to_string(), "it is a folder, and a file is to be written", "Give the name of a file"));
     }
+    refuse_folder_name(path)?;
     refuse_unasked(path, overwrite)
+}
+
+/// Refuses a `path` that ends with a separator, as only names of folders may: a file would fail to get this name when it is finished.
+fn refuse_folder_name(path: &Path) -> Result<()> {
+    let is_separator = |byte: &u8| std::path::is_separator(char::from(*byte));
+    if !path.as_os_str().as_encoded_bytes().last().is_some_and(is_separator) {
+        return Ok(());
+    }
+    Err(Error::parameter(
+        path.display().to_string(),
+        "it ends with a separator, as the name of a folder, and a file is to be written",
+        "Give the name of a file",
+    ))
 }
 
 fn refuse_unasked(path: &Path, overwrite: bool) -> Result<()> {
@@ -79,12 +93,13 @@ fn refuse_unasked(path: &Path, overwrite: bool) -> Result<()> {
 }
 
 /// Refuses a `path` that exists and holds something else than what will be written there. `kind` says what that is ("a PNG image"); `is_kind` tells it by the
-/// first bytes of a file, 4,096 at most. An empty file may be replaced, and a link that leads to nothing yet may be written through. Call it before long work.
+/// first bytes of a file, 4,096 at most. An empty file may be replaced, and a link that leads to nothing yet may be written through; a name that ends with a
+/// separator is refused. Call it before long work.
 ///
 /// # Errors
 /// [`Error::Parameter`], and [`Error::Io`] for a file that cannot be read.
 pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8]) -> bool) -> Result<()> {
-    let Ok(found) = std::fs::metadata(path) else { return Ok(()) };
+    let Ok(found) = std::fs::metadata(path) else { return refuse_folder_name(path) };
     let (mut head, is_file) = (Vec::new(), found.is_file());
     if !is_file && !found.is_dir() {
         // A device or a pipe holds nothing that could be lost.
@@ -109,8 +124,11 @@ pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8])
 /// [`Error::Parameter`], and [`Error::Io`] for a folder that cannot be listed.
 pub fn check_target(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
     let refuse = |problem: &str, remedy: &str| Err(Error::parameter(path.display().to_string(), problem, remedy));
-    let Ok(found) = std::fs::symlink_metadata(path) else { return Ok(()) };
-    match target.at(path) {
+    let target = target.at(path);
+    let Ok(found) = std::fs::symlink_metadata(path) else {
+        return if matches!(target, ExportTarget::File(_)) { refuse_folder_name(path) } else { Ok(()) };
+    };
+    match target {
         // Also behind a link, where a file would take its place.
         ExportTarget::File(_) if path.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
         // A rename would put a file in its place.
@@ -270,6 +288,20 @@ mod tests {
                 assert!(!message.contains("--overwrite") && message.contains("Give "), "{message}");
             }
         }
+        // With a separator at its end a name is that of a folder, whatever is there.
+        for name in ["a.txt/", "new.txt/"] {
+            let path = folder.path().join(name);
+            let refused = [
+                refuse_existing(&path, true),
+                refuse_other_content(&path, "a list", |_| true),
+                check_target(&path, ExportTarget::File("txt"), true),
+                check_target(&path, ExportTarget::FileOrFolder { file: "txt", folder: &["b.txt"] }, true),
+            ];
+            for message in refused.map(|refused| refused.unwrap_err().to_string()) {
+                assert!(message.contains(name) && message.contains("ends with a separator") && message.contains("Give "), "{message}");
+            }
+        }
+        check_target(&folder.path().join("new/"), ExportTarget::Folder(&["b.txt"]), false).unwrap();
         assert!(refuse_existing(&file, false).unwrap_err().to_string().contains("--overwrite"));
         refuse_existing(&file, true).unwrap();
         assert_eq!(std::fs::read(&file).unwrap(), b"mine");

@@ -19,6 +19,10 @@ struct AgreeReport {
 
 /// Draws the views of a split on several devices and compares the images.
 pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
+    if args.devices.len() < 2 {
+        let object = format!("--devices {}", args.devices.join(","));
+        return Err(Error::parameter(object, "one device has nothing to be compared with", "Give at least two, such as flex,wgpu or flex,flex/reference"));
+    }
     let events = context.listeners(None)?;
     let mut models = Vec::new();
     for name in &args.devices {

@@ -2,7 +2,8 @@
 
 use super::{Playback, Spread, WARM_UP, scene_cases, time_playback};
 use crate::args::BenchFrame;
-use crate::commands::{Context, create_parent};
+use crate::commands::{Context, check_writable, create_parent};
+use crate::ignored::{Stated, refuse_ignored};
 use crate::interrupt;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
@@ -73,6 +74,7 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     }
     if let Some(archive) = &args.archive {
         refuse_other_content(archive, "an archive", |head| head.starts_with(&MAGIC))?;
+        check_writable(archive)?;
     }
     let stop = interrupt::stop_flag()?;
     for (done, case) in wanted.iter().enumerate() {
@@ -120,6 +122,10 @@ fn scene_model(context: &Context, case: &SceneCase, config: &RunConfig, device: 
         seed: seed.child("field"),
     };
     let mut field = context.registry.build_deformer(&config.deformer, &deformer, device)?;
+    if field.is_static() {
+        let (value, remedy) = ((args.motion > 0.0).then(|| args.motion.to_string()), "Leave it out, or choose a deformer (--set deformer.kind=NAME)".into());
+        refuse_ignored("a deformer that moves nothing", [Stated { option: "--motion", value, used: false, remedy }])?;
+    }
     if args.motion > 0.0 && !rows.is_empty() {
         set_in_motion(field.as_mut(), moving_means(&gaussians, &rows, device), args.motion, seed.child("motion"))?;
     }

@@ -13,7 +13,7 @@ use cc4dgs_train::sweep::{
     run_training, select, summary, write_tables,
 };
 use serde::Serialize;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Exit code of `sweep run --no-wait` where another process works on the training: try again later.
 pub const BUSY: u8 = 75;
@@ -187,20 +187,28 @@ fn check_scheduler(args: &SweepEmit) -> Result<()> {
     refuse_ignored(&format!("jobs of {}", written(&args.scheduler)), stated)
 }
 
+/// `path` as a job file has it, where `option` states another one. Other text in its place would name another file.
+fn unicode(path: PathBuf, option: &str) -> Result<String> {
+    path.into_os_string().into_string().map_err(|name| {
+        let remedy = format!("Give it another name, or state what the jobs call it ({option})");
+        Error::parameter(name.to_string_lossy(), "its name is not UTF-8, and a job file is text", remedy)
+    })
+}
+
 pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
     check_scheduler(args)?;
     let plan = Plan::read(&args.dir)?;
     // Schedulers want the folder of their logs to exist.
     SweepFolder::new(&args.dir).create()?;
-    let absolute = |path: &Path| std::path::absolute(path).map(|path| path.display().to_string()).map_err(|e| Error::io(path, e));
+    let absolute = |path: &Path, option: &str| std::path::absolute(path).map_err(|e| Error::io(path, e)).and_then(|path| unicode(path, option));
     let program = match (&args.program, args.scheduler) {
         (Some(program), _) => program.clone(),
-        (None, SchedulerArg::Slurm) => std::env::current_exe().map_err(|e| Error::io("the program", e))?.display().to_string(),
+        (None, SchedulerArg::Slurm) => unicode(std::env::current_exe().map_err(|e| Error::io("the program", e))?, "--program")?,
         (None, _) => "cc4dgs".into(),
     };
     let options = EmitOptions {
-        folder: args.job_dir.clone().map_or_else(|| absolute(&args.dir), Ok)?,
-        working_folder: args.cd.clone().map_or_else(|| absolute(Path::new(".")), Ok)?,
+        folder: args.job_dir.clone().map_or_else(|| absolute(&args.dir, "--job-dir"), Ok)?,
+        working_folder: args.cd.clone().map_or_else(|| absolute(Path::new("."), "--cd"), Ok)?,
         program,
         threads: if threads == 0 { 1 } else { threads },
         limits: context.limit_options.to_vec(),
@@ -228,6 +236,15 @@ mod tests {
     #[test]
     fn paths_with_spaces_are_one_word_of_the_next_command() {
         assert_eq!(["runs/tiny-1", "my runs", "it's", ""].map(word), ["runs/tiny-1", "'my runs'", "'it'\\''s'", "''"]);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn job_files_have_no_name_in_place_of_another() {
+        assert_eq!(unicode("/runs/tiny é".into(), "--job-dir").unwrap(), "/runs/tiny é");
+        let name: &std::ffi::OsStr = std::os::unix::ffi::OsStrExt::from_bytes(b"/runs/\xff");
+        let message = unicode(name.into(), "--job-dir").unwrap_err().to_string();
+        assert!(["/runs/", "not UTF-8", "--job-dir"].iter().all(|part| message.contains(part)), "{message}");
     }
 
     #[test]
