@@ -1,16 +1,20 @@
 #!/usr/bin/env python3
-"""Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE [--program cc4dgs] [--native frames] [--case n3dv] [--out FILE].
+"""Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE [--program cc4dgs] [--native frames] [--case n3dv]
+[--gaussians N] [--out FILE].
 
 PAGE is the folder of apps/player/build-web. The model is the synthetic scene of `cc4dgs bench frame`, as large as published scenes: 335,000 Gaussians at 1352x1014, of which
-12 % move. It is stored with a playback layer (`--archive`), and page and tile renderer look from the same camera. Prints JSON: bytes of the bundle (gzipped) and of
-the archive, milliseconds from the last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex`,
-deformer included; the medians of alternating rounds. Frames of WebGL2 do not wait for the worker that sorts. With --native (the example `frames` of the player), also
+12 % move. With software rendering that takes very long, and may not finish: choose --gaussians 10000 there. Images then have the same share of the case's pixels as the
+scene has of its Gaussians. The scene is stored with a playback layer (`--archive`), and page and tile renderer look from the same camera. Prints JSON: bytes of the
+bundle (gzipped) and of the archive, milliseconds from the last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the
+device `flex`, deformer included; the medians of alternating rounds. Frames of WebGL2 do not wait for the worker that sorts. With --native (the example `frames` of the player), also
 those of the renderer of the window on the graphics adapter of this machine. Needs playwright, and Chromium on the path.
 """
 import argparse, gzip, json, pathlib, statistics, subprocess, tempfile
 from chromium import launch, serve
 from playwright.sync_api import sync_playwright
 
+# Gaussians of each case of `cc4dgs bench frame`.
+GAUSSIANS = 335000
 ROUNDS = 3
 FRAMES = 4
 LOAD = """async () => {
@@ -35,7 +39,8 @@ FRAME = """async frames => {
 
 def synthetic_scene(args, frames, *more):
     """What `cc4dgs bench frame` says of the case."""
-    command = [args.program, "--quiet", "bench", "frame", "--case", args.case, "--scale", args.scale, "--motion", "0.05", "--device", "flex"]
+    scale = args.scale if args.gaussians is None else repr(args.gaussians / GAUSSIANS)
+    command = [args.program, "--quiet", "bench", "frame", "--case", args.case, "--scale", scale, "--motion", "0.05", "--device", "flex"]
     ran = subprocess.run([*command, "--set", f"deformer.kind={args.deformer}", "--frames", str(frames), *more, "--json"], capture_output=True, text=True)
     if ran.returncode:
         raise SystemExit(ran.stderr)
@@ -53,8 +58,13 @@ def native(args, archive, size):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page"), parser.add_argument("--program", default="cc4dgs"), parser.add_argument("--case", default="n3dv")
-    parser.add_argument("--scale", default="1"), parser.add_argument("--deformer", default="cdf-basis"), parser.add_argument("--native"), parser.add_argument("--out")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--scale", default="1", help="share of the case's pixels and Gaussians")
+    size.add_argument("--gaussians", type=int, metavar="N", help="Gaussians, with the same share of the pixels; 335000 by default, and 10000 for software rendering")
+    parser.add_argument("--deformer", default="cdf-basis"), parser.add_argument("--native"), parser.add_argument("--out")
     args = parser.parse_args()
+    if args.gaussians is not None and not 1 <= args.gaussians <= 100 * GAUSSIANS:
+        parser.error(f"--gaussians {args.gaussians} is not from 1 to {100 * GAUSSIANS}")
     folder = tempfile.TemporaryDirectory()
     archive = pathlib.Path(folder.name) / "scene.cc4d"
     case = synthetic_scene(args, 1, "--archive", str(archive))

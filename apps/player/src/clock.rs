@@ -22,6 +22,10 @@ impl Clock {
     pub fn new(frames: usize, seconds: f32) -> Self {
         Self { time: 0.0, playing: false, speed: 1.0, looping: true, seconds: seconds.max(1e-3), frames: frames.max(1) }
     }
+    /// A clock at the start of another sequence, of `frames` frames that last `seconds`: it stands still, at the speed of this one, and loops where this one does.
+    pub fn of_other(&self, frames: usize, seconds: f32) -> Self {
+        Self { speed: self.speed, looping: self.looping, ..Self::new(frames, seconds) }
+    }
     /// Moves on by `elapsed_s` seconds of the real clock; whether time changed.
     pub fn tick(&mut self, elapsed_s: f32) -> bool {
         if !self.playing || self.frames < 2 || elapsed_s.is_nan() || elapsed_s <= 0.0 {
@@ -104,6 +108,12 @@ mod tests {
         clock.seconds = 1e-3;
         clock.tick(1.0);
         assert!((0.0..=1.0).contains(&clock.time), "{}", clock.time);
+        (clock.speed, clock.looping) = (-0.5, false);
+        assert_eq!(
+            clock.of_other(31, 4.0),
+            Clock { speed: -0.5, looping: false, ..Clock::new(31, 4.0) },
+            "another sequence plays at the speed that was chosen"
+        );
         let mut still = Clock::new(1, 2.0);
         still.step(1);
         assert_eq!((still.time, still.frame()), (0.0, 0), "a single frame has no next one");

@@ -8,11 +8,12 @@ the path. Ends with a sentence per check; fails at the first that does not hold.
 import argparse, pathlib, time
 from browser_calls import calls
 from browser_destroy import destroyed
-from browser_faults import broken_module, cancelled, fetched_meanwhile, few_degrees, half_arrived, hopeless, missing_files, opened_early, opened_meanwhile, out_of_memory, refused, second_player, small_textures, told_once
+from browser_faults import broken_module, cancelled, fetched_meanwhile, few_degrees, half_arrived, hopeless, incomplete, missing_files, opened_early, opened_meanwhile, out_of_memory, refused, second_player, small_textures, told_once
 from browser_gaussian import one_gaussian, remarks
-from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, layouts, low, reduced_motion, touch, typing, wheel
+from browser_input import cameras, command_key, drop, embedded, focus, held, key_list, layouts, low, reduced_motion, released, touch, typing, wheel
 from browser_keep import frames, reloaded, several, shapes
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
+from browser_size import freed, sizes
 from browser_sort import sorting
 from playwright.sync_api import sync_playwright
 
@@ -83,6 +84,7 @@ def main():
         page, facts = loading(pages)
         playing(page)
         navigation(pages, page)
+        released(page)
         wheel(page)
         command_key(page)
         layouts(page)
@@ -100,6 +102,8 @@ def main():
         told_once(pages)
         refused(pages)
         small_textures(pages)
+        sizes(pages)
+        freed(pages)
         half_arrived(pages)
         cancelled(pages)
         out_of_memory(pages)
@@ -128,6 +132,8 @@ def main():
         for file, name in ((args.single, "single"), (args.weights, "weights")):
             if file:
                 from_disk(pages, pathlib.Path(file).resolve(), name, facts)
+        if args.single:
+            incomplete(pages, pathlib.Path(args.single))
         pages.browser.close()
     say("all checks passed")
 

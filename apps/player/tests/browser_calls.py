@@ -28,6 +28,24 @@ RIVALS = """async address => { const { fetch } = window, bytes = new Uint8Array(
     return [first, facts.frames, cc4dgs.source, cc4dgs.shown.source]; }"""
 
 
+# Sets what is no number; returns what is said. Then what is out of range; returns what is set.
+NUMBERS = """() => { const said = [["speed", NaN], ["scale", "large"], ["resolution", undefined], ["shDegree", null]].map(([name, value]) => {
+        try { cc4dgs.set(name, value); return "it is set"; } catch (e) { return e.message; } });
+    const names = ["scale", "resolution", "shDegree", "tint"], { settings } = cc4dgs, own = { ...settings };
+    [100, 0, -1, 1].forEach((value, k) => cc4dgs.set(names[k], value));
+    const set = names.map(name => settings[name]);
+    names.forEach(name => cc4dgs.set(name, own[name]));
+    return [said, set]; }"""
+# Loads what is no model of any kind; returns what is said, and whether the model before is still there.
+NOTHING = """async () => { const { source } = cc4dgs, said = [];
+    for (const other of [null, undefined, 42, {}]) said.push(await cc4dgs.load(other).then(() => "it loaded", e => e.message));
+    return [said, cc4dgs.source === source && !!cc4dgs.facts]; }"""
+# Loads a part of a larger array; returns its frames.
+PART = """async address => { const bytes = new Uint8Array(await (await fetch(address)).arrayBuffer()), all = new Uint8Array(bytes.length + 8);
+    all.set(bytes, 3);
+    return (await cc4dgs.load(new DataView(all.buffer, 3, bytes.length), "part.cc4d")).frames; }"""
+
+
 def calls(pages):
     page = pages.open(f"?src={MODEL}")
     message = page.evaluate(UNKNOWN)
@@ -40,6 +58,12 @@ def calls(pages):
     frames = page.evaluate("cc4dgs.facts.frames")
     rivals = page.evaluate(RIVALS, MODEL)
     assert rivals == [None, frames, "/second.cc4d", "/second.cc4d"], f"a model that another one replaced goes on: {rivals}"
+    said, taken = page.evaluate(NUMBERS)
+    assert all("is a number" in message for message in said), f"settings that are no numbers: {said}"
+    assert taken == [10, 0.1, 0, True], f"settings that are out of range are {taken}"
+    said, stays = page.evaluate(NOTHING)
+    assert all("was given" in message for message in said) and stays, f"what is no model: {said}, the one before stays: {stays}"
+    assert page.evaluate(PART, MODEL) == frames, "a view of a buffer is not opened"
     page.close()
     pages.quiet("calls")
-    say("unknown settings are refused, a new model ends the playback of the one before, and nothing is drawn at speed 0")
+    say("unknown settings and what is no model are refused, a new model ends the playback of the one before, and nothing is drawn at speed 0")

@@ -36,6 +36,11 @@ DESTROY_LOST = """() => new Promise(done => { const player = cc4dgs;
     };
     if (player.gl) player.gl.gl.getExtension("WEBGL_lose_context").loseContext(); else player.gpu.loseDevice(); })"""
 
+# Makes a player in the element of the page's own one. Returns whether that is destroyed, its memory, the elements, and whether the new one shows the model.
+REPLACE = """async source => { const { createPlayer } = await import("./player.js"), { gpu } = cc4dgs, old = cc4dgs, element = document.getElementById("player");
+    window.cc4dgs = await createPlayer(element, { src: source });
+    return [old.destroyed, gpu.__wbg_ptr, element.childElementCount, cc4dgs.facts?.frames > 1]; }"""
+
 
 def destroyed(pages, facts):
     """A player that is destroyed leaves nothing behind, and its element to another one."""
@@ -56,6 +61,8 @@ def destroyed(pages, facts):
         assert page.evaluate("[cc4dgs.playing, inner.playing]") == [True, False], "a key of a player inside of the page reached the page's own player"
         page.evaluate("cc4dgs.pause(); inner.destroy()")
         assert page.evaluate("cc4dgs.capture().then(p => p.data.some(v => v > 60 && v < 255))"), "the second player of an element shows nothing"
+        found = page.evaluate(REPLACE, MODEL)
+        assert found == [True, 0, 1, True], f"a player whose element another one takes goes on: {found}"
         end, *left = page.evaluate(DESTROY_LOST)
         assert "destroyed" in end and not any(left), f"a recovery goes on after its player was destroyed: {[end, *left]}"
         page.close()

@@ -1,5 +1,7 @@
 """Checks of browser.py: what the page says where memory, textures, devices or connections fail."""
+import pathlib, tempfile
 from browser_pages import Handler, MODEL, PATIENCE_MS, say
+from browser_size import WEBGL as TEXTURES
 
 # Counts what players of the page tell, from their first message on.
 TOLD = """async source => { const { createPlayer } = await import("./player.js"), own = cc4dgs.constructor.prototype, { emit } = own;
@@ -8,9 +10,6 @@ TOLD = """async source => { const { createPlayer } = await import("./player.js")
     await createPlayer(document.body.appendChild(document.createElement("div")), { src: source });
     own.emit = emit;
     return told; }"""
-# Textures of `side` texels, and no more.
-TEXTURES = """side => { const own = WebGL2RenderingContext.prototype, { getParameter } = own;
-    own.getParameter = function (name) { return name === this.MAX_TEXTURE_SIZE ? side : getParameter.call(this, name); }; }"""
 # Buffers of `bytes`, and no more.
 BUFFERS = "bytes => { Object.defineProperty(GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', { get: () => bytes }); }"
 # Shows Gaussians and motion of `source` while the harmonics arrive, sets time, pose and playback, and then breaks the connection, or opens what is no model. The rest
@@ -104,18 +103,13 @@ def refused(pages):
 
 
 def small_textures(pages):
-    """WebGL2 with small textures: canvases and images fit, and models that do not are refused."""
-    page = pages.open(f"?src={MODEL}&backend=webgl", before=f"({TEXTURES})(512)")
-    page.evaluate("cc4dgs.set('resolution', 2); cc4dgs.draw()")
-    sides = page.evaluate("[cc4dgs.ui.canvas.width, cc4dgs.ui.canvas.height, ...cc4dgs.gl.size]")
-    assert max(sides) == 512 and abs(sides[0] / sides[1] - 1280 / 800) < 0.01 and abs(sides[2] / sides[3] - 1280 / 800) < 0.01, sides
-    page.close()
+    """Models that do not fit into textures of WebGL2 are refused."""
     page = pages.open(f"?src={MODEL}&backend=webgl", before=f"({TEXTURES})(1)")
     message = page.evaluate(ALERT)
     assert "texture" in message and page.evaluate("cc4dgs.facts") is None and page.get_by_label("Play", exact=True).is_disabled(), message
     page.close()
     pages.quiet("small textures")
-    say(f"images fit into small textures; models that do not: {message}")
+    say(f"a model that does not fit into small textures: {message}")
 
 
 def half_arrived(pages):
@@ -313,3 +307,20 @@ def broken_module(pages):
     pages.complaints[:] = [c for c in pages.complaints if "net::ERR_" not in c]
     pages.quiet("a module that could not be fetched")
     say("a module that could not be fetched is fetched again by the next player")
+
+
+def incomplete(pages, path):
+    """One HTML file that lacks its end, or whose module is damaged, says so in place of staying blank."""
+    text = path.read_text()
+    cases = {"its end is missing": text[:len(text) // 2], "could not be started": text.replace('id="renderer">', 'id="renderer">AAAA', 1)}
+    with tempfile.TemporaryDirectory() as folder:
+        for said, content in cases.items():
+            file = pathlib.Path(folder) / "damaged.html"
+            file.write_text(content)
+            page = pages.watch(pages.browser.new_page())
+            page.goto(file.as_uri())
+            page.wait_for_function(f"document.body.innerText.includes({said!r})")
+            page.close()
+    # The browser itself logs why the module cannot be unpacked.
+    pages.complaints.clear()
+    say("an incomplete HTML file, and a damaged one, say so")

@@ -33,6 +33,20 @@ def drop(page, facts):
     say("a file that is dropped on the page is opened; what is no file is refused with a message")
 
 
+def released(page):
+    """A pointer whose capture ends turns nothing any more: nobody tells when it is up."""
+    page.evaluate("cc4dgs.reset(); cc4dgs.ui.canvas.addEventListener('pointerdown', e => { window.pressed = e.pointerId; }, { once: true })")
+    page.mouse.move(600, 300), page.mouse.down()
+    page.evaluate("window.heard = new Promise(done => cc4dgs.ui.canvas.addEventListener('pointermove', done, { once: true })).then(() => 0); cc4dgs.ui.canvas.releasePointerCapture(pressed)")
+    before = page.evaluate(POSE)
+    page.mouse.move(700, 340)
+    page.evaluate("heard")
+    after = page.evaluate(POSE)
+    page.mouse.up()
+    assert before == after, "a pointer that lost its capture turns the view"
+    say("a pointer that lost its capture turns nothing")
+
+
 def wheel(page):
     """A notch zooms as far in pixels, in lines and in pages."""
     arms = []
@@ -103,6 +117,8 @@ def typing(page):
         field.remove();
         return !typed || cc4dgs.flyKeys(0); })""")
     assert not any(taken), f"the player takes the keys of a text field: {taken}"
+    # Chromium tells of a field that it fills in by such events. What a listener throws is a complaint.
+    page.evaluate("['keydown', 'keyup'].forEach(name => document.body.dispatchEvent(new Event(name, { bubbles: true, cancelable: true })))")
     say("text fields beside the player keep their keys")
 
 

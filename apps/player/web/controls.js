@@ -228,7 +228,13 @@ export function build(container, player) {
     const ui = {
         root, canvas, embedded,
         remove: () => { ui.poster(null); root.remove(); },
-        replaceCanvas: () => { const fresh = ui.canvas.cloneNode(); ui.canvas.replaceWith(fresh); ui.canvas = fresh; },
+        replaceCanvas: () => {
+            const old = ui.canvas, focused = root.getRootNode().activeElement === old;
+            ui.canvas = old.cloneNode();
+            old.replaceWith(ui.canvas);
+            // What is removed loses the focus, and keys would reach the player no more.
+            if (focused) ui.canvas.focus({ preventScroll: true });
+        },
         title: text => { title.textContent = text; if (!embedded) document.title = `${text} – cc4dgs player`; },
         error: text => say(text, true),
         note: text => say(text, false),

@@ -41,6 +41,8 @@ export function addGestures(canvas, act, signal) {
     };
     listen("pointerup", up);
     listen("pointercancel", up);
+    // Without the capture nobody tells that a pointer is up.
+    listen("lostpointercapture", up);
     listen("contextmenu", e => e.preventDefault());
     listen("wheel", e => {
         e.preventDefault();
@@ -83,7 +85,8 @@ export function commandsOf(player, act) {
 /// What a key is called here: what it types, letters in lower case, or its name. On layouts without Latin letters it has the letter of its position (`code`), as in
 /// the window of `cc4dgs view`.
 function nameOfKey({ key, code }) {
-    if (key.length !== 1) return key;
+    // Chromium tells of a field that it fills in by a key without a name.
+    if (key?.length !== 1) return key ?? "";
     const letter = /^[!-~ ]$/.test(key) ? key : /^Key([A-Z])$/.exec(code)?.[1] ?? key;
     return letter.toLowerCase();
 }

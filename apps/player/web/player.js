@@ -20,14 +20,22 @@ export const PAGE_VERSION = 4;
 // An address as text; other sources as they are.
 const addressed = source => (source instanceof URL ? source.href : source);
 
+// The least and the largest value of the settings that are numbers.
+const RANGES = { speed: [-Infinity, Infinity], scale: [0.01, 10], shDegree: [0, 4], resolution: [0.1, 2] };
+
 const gone = () => new Error("This player was destroyed. Make another one with createPlayer.");
 
 let ready;
+// The player in each element.
+const players = new WeakMap();
 
 export async function createPlayer(container, options = {}) {
     const query = new URLSearchParams(location.search);
     const { src = query.get("src") ?? undefined, autoplay = query.has("autoplay"), backend = query.get("backend") } = options;
+    // It would go on unseen, with its model on the graphics card.
+    players.get(container)?.destroy();
     const player = new Page(container, backend);
+    players.set(container, player);
     player.own = addressed(src);
     const view = options.remember === false ? null : restore(player);
     // Where there is no model, the link is for the file that is opened first.
@@ -118,6 +126,8 @@ class Page {
     async load(source, name, first = null) {
         if (this.destroyed) throw gone();
         source = addressed(source);
+        const opens = typeof source === "string" || source?.byteLength >= 0 || typeof source?.arrayBuffer === "function";
+        if (!opens) throw new Error(`The player opens an address (a text or a URL), a File, or bytes, and was given ${source === null ? "null" : typeof source}.`);
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
@@ -164,7 +174,8 @@ class Page {
             } else {
                 const label = name ?? source.name ?? "model";
                 checkSize(label, source.size ?? source.byteLength ?? 0);
-                const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer ? bytesOf(label, source) : source));
+                const bytes = ArrayBuffer.isView(source) ? new Uint8Array(source.buffer, source.byteOffset, source.byteLength)
+                    : new Uint8Array(await (source.arrayBuffer ? bytesOf(label, source) : source));
                 if (signal.aborted) return null;
                 this.ui.title(label);
                 this.received = bytes.length;
@@ -274,19 +285,22 @@ class Page {
     set(name, value) {
         const names = [...Object.keys(this.settings), "flying"];
         if (!names.includes(name)) throw new Error(`The player has no setting ${name}. Use one of ${names.join(", ")}.`);
-        if (name === "flying") this.flying = value; else this.settings[name] = value;
+        const range = RANGES[name], number = Number.parseFloat(value);
+        if (range && !Number.isFinite(number)) throw new Error(`The setting ${name} is a number, and ${String(value)} is none.`);
+        const taken = range ? Math.min(Math.max(number, range[0]), range[1]) : !!value;
+        if (name === "flying") this.flying = taken; else this.settings[name] = name === "shDegree" ? Math.round(taken) : taken;
         this.ui.settings({ ...this.settings, flying: this.flying });
         this.apply();
     }
     apply() { if (this.gpu) Object.assign(this.gpu, this.settings); this.dirty = true; }
     resize() {
+        if (!this.gpu) return;
         const { canvas } = this.ui;
         this.ratio = window.devicePixelRatio;
-        // WebGL2 draws no more pixels each way than it has.
-        const ratio = Math.min(this.ratio || 1, 2, (this.gl?.mostSide ?? Infinity) / Math.max(canvas.clientWidth, canvas.clientHeight, 1));
-        const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio))];
+        const ratio = Math.min(this.ratio || 1, 2);
+        // What cannot be drawn becomes smaller.
+        const [width, height] = this.gpu.resize(Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio));
         if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-        this.gpu?.resize(width, height);
         this.dirty = true;
         this.draw();
     }

@@ -85,16 +85,18 @@ export class Sorter {
     }
     /// A worker that has the model; null where the browser allows none. Its text is an address of its own, so pages that were opened from disk can start it.
     start() {
-        let address;
+        let address, worker;
         try {
             address = URL.createObjectURL(new Blob([WORKER], { type: "text/javascript" }));
-            const worker = new Worker(address);
+            worker = new Worker(address);
             worker.onmessage = ({ data }) => this.answered(data);
             worker.onerror = worker.onmessageerror = e => { e.preventDefault(); this.fail(e.message); };
             worker.postMessage({ model: this.model });
             return worker;
         } catch (e) {
             console.warn(`Sorting in a worker: ${e.message}`);
+            // It has started where only the model is too large to be sent.
+            worker?.terminate();
             return null;
         } finally {
             if (address) setTimeout(() => URL.revokeObjectURL(address), 60000);

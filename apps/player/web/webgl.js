@@ -241,12 +241,28 @@ export class WebGl {
         [this.visible, this.settled] = [order.length, this.sorter.has(view)];
         return order;
     }
-    /// Draws the view of `player` to the canvas; or a capture through a camera at a time to `output`.
-    draw(player, camera, time, output = null, size = [this.canvas.width, this.canvas.height]) {
-        const { gl } = this;
+    /// The uniforms of a frame, and columns and rows of its image.
+    frame(player, camera, time) {
         const bytes = player.plainFrame(camera, time).slice();
-        const shape = new Float32Array(bytes.buffer, 96, 2);
-        this.target(shape[0], shape[1]);
+        return { bytes, shape: new Float32Array(bytes.buffer, 96, 2) };
+    }
+    /// The frame of what the canvas shows, with its target: of fewer pixels where there is no memory for all.
+    interactive(player) {
+        for (;;) {
+            const frame = this.frame(player);
+            try {
+                this.target(...frame.shape);
+                return frame;
+            } catch (e) {
+                if (!player.drawFewer()) throw e;
+            }
+        }
+    }
+    /// Draws the view of `player` to the canvas; or a capture of `size` through a camera at a time to `output`.
+    draw(player, camera, time, output = null, size = null) {
+        const { gl } = this;
+        const { bytes, shape } = output ? this.frame(player, camera, time) : this.interactive(player);
+        if (output) this.target(...shape);
         const functions = player.plainFunctions(time), order = this.order(bytes, functions, output !== null);
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
         gl.viewport(0, 0, shape[0], shape[1]);
@@ -273,7 +289,8 @@ export class WebGl {
             gl.disable(gl.BLEND);
         }
         gl.bindFramebuffer(gl.FRAMEBUFFER, output);
-        gl.viewport(0, 0, size[0], size[1]);
+        // A browser may give a large canvas fewer pixels than it has columns and rows.
+        gl.viewport(0, 0, ...(size ?? [gl.drawingBufferWidth, gl.drawingBufferHeight]));
         gl.useProgram(this.presents.program);
         this.uniforms(this.presents, bytes);
         gl.activeTexture(gl.TEXTURE0);
@@ -285,8 +302,7 @@ export class WebGl {
     /// RGBA pixels, the upper row first.
     capture(player, camera, time) {
         const { gl } = this;
-        const shape = new Float32Array(player.plainFrame(camera, time).slice().buffer, 96, 2);
-        const [width, height] = shape;
+        const [width, height] = this.frame(player, camera, time).shape;
         const raw = new Uint8Array(4 * width * height), data = new Uint8ClampedArray(raw.length), texture = gl.createTexture(), buffer = gl.createFramebuffer();
         try {
             gl.activeTexture(gl.TEXTURE0);

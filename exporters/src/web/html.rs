@@ -12,25 +12,35 @@ use std::io::Write;
 const TEMPLATE: &str = include_str!("page.html");
 /// Modules inside one file have no addresses; they import each other by names with this prefix, which an import map resolves.
 const PREFIX: &str = "cc4dgs/";
-/// Starts the player of a single file from the contents of its other elements.
-const START: &str = r#"import { createPlayer } from "cc4dgs/player.js";
+/// Starts the player of a single file from the contents of its other elements. What fails before there is a player is said on the page.
+const START: &str = r#"const element = document.getElementById("player");
 const bytes = id => {
     const text = atob(document.getElementById(id).textContent), out = new Uint8Array(text.length);
     for (let i = 0; i < out.length; i++) out[i] = text.charCodeAt(i);
     return out;
 };
 const unpacked = packed => new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
-const { name, autoplay } = JSON.parse(document.getElementById("settings").textContent);
-const wasm = await unpacked(bytes("renderer"));
-window.cc4dgs = await createPlayer(document.getElementById("player"), { src: bytes("model"), name, wasm, autoplay });"#;
+try {
+    const { createPlayer } = await import("cc4dgs/player.js");
+    const { name, autoplay } = JSON.parse(document.getElementById("settings").textContent);
+    const wasm = await unpacked(bytes("renderer")), src = bytes("model");
+    window.cc4dgs = await createPlayer(element, { src, name, wasm, autoplay });
+} catch (e) {
+    element.textContent = `The player could not be started (${e.message}). Download or copy this file again; where that does not help, export it again.`;
+    throw e;
+}"#;
 
 /// Longest text that a browser (V8) holds, in characters.
 const MOST_TEXT: usize = (1 << 29) - 24;
 
-/// Browsers without import maps or `DecompressionStream` would show nothing.
-const OLD_BROWSER: &str = r#"<script>
+/// Says what would leave the page blank: browsers without import maps or `DecompressionStream`, and files that end before the script that starts the player.
+const BLANK: &str = r#"<script>
 if (!window.DecompressionStream || !HTMLScriptElement.supports || !HTMLScriptElement.supports("importmap")) document.getElementById("player").textContent =
     "This page needs a newer browser: Chrome or Edge 96, Firefox 113, Safari 16.4, or later.";
+else document.addEventListener("DOMContentLoaded", () => {
+    if (!document.getElementById("start")) document.getElementById("player").textContent =
+        "This file is not complete: its end is missing. Download or copy it again; where that does not help, export it again.";
+});
 </script>
 "#;
 
@@ -123,11 +133,11 @@ pub(super) fn single(page: &Page, title: &str, archive: &[u8], autoplay: bool) -
     let data = |id: &str, kind: &str, content: &str| format!("<script type=\"{kind}\" id=\"{id}\">{content}</script>\n");
     let head = format!("<style>\n{style}</style>\n<script type=\"importmap\">{}</script>", script_json(&json!({ "imports": imports })));
     let body = [
-        OLD_BROWSER.to_string(),
+        BLANK.to_string(),
         data("settings", "application/json", &script_json(&json!({ "autoplay": autoplay, "name": title }))),
         data("renderer", "text/plain", &STANDARD.encode(packed)),
         data("model", "text/plain", &STANDARD.encode(archive)),
-        format!("<script type=\"module\">\n{START}\n</script>"),
+        data("start", "module", &format!("\n{START}\n")),
     ];
     Ok(document(title, &head, &body.concat()))
 }
@@ -152,6 +162,21 @@ mod tests {
         assert!(!html.contains("src=\"") && !html.contains("href=\"player"), "nothing is fetched");
         let (told, started) = (html.find("newer browser").unwrap(), html.find("createPlayer").unwrap());
         assert!(told < started, "old browsers are told before anything fails");
+    }
+
+    #[test]
+    fn a_file_that_is_cut_off_or_damaged_says_so() {
+        let html = single(&page(), "t", b"archive", true).unwrap();
+        let (said, model) = (html.find("its end is missing").unwrap(), html.find(r#"id="model""#).unwrap());
+        assert!(said < model, "the script that says so is cut off, too");
+        // It looks for the script that starts the player, which is the last.
+        let start = html.find(r#"<script type="module" id="start">"#).unwrap();
+        assert!(html[..said].contains(r#"getElementById("start")"#) && start > model && html[start..].matches("<script").count() == 1, "{html}");
+        let (tries, says) = (html[start..].find("try {").unwrap(), html[start..].find("could not be started (${e.message})").unwrap());
+        assert!(["import(\"cc4dgs/player.js\")", "bytes(\"renderer\")", "bytes(\"model\")"].iter().all(|work| {
+            let at = html[start..].find(work).unwrap();
+            tries < at && at < says
+        }));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! The time and the pose that a window begins at, as the options of a command.
 
-use crate::navigator::{POSE_ASPECT, POSE_FOV};
+use crate::navigator::pose::{POSE_ASPECT, POSE_FOV};
 use crate::{Navigator, Pose};
 use cc4dgs_format::{Error, Result};
 use std::path::Path;

@@ -2,6 +2,7 @@
 
 mod device;
 mod pipelines;
+mod size;
 mod target;
 mod uniforms;
 mod uploaded;
@@ -15,6 +16,9 @@ use uploaded::Uploaded;
 #[cfg(all(feature = "window", not(target_arch = "wasm32")))]
 pub(crate) use device::descriptor;
 pub use device::{device_of, request_device};
+pub(crate) use size::MostPixels;
+#[cfg(any(target_arch = "wasm32", feature = "window"))]
+pub(crate) use size::remark;
 #[cfg(target_arch = "wasm32")]
 pub(crate) use uniforms::{Frame, functions};
 
@@ -114,23 +118,23 @@ impl Renderer {
     pub fn scene(&self) -> Option<&Scene> {
         self.uploaded.as_ref().map(|u| &u.scene)
     }
-    /// Largest side of an image in pixels.
-    fn most_pixels(&self) -> u32 {
-        self.device.limits().max_texture_dimension_2d
+    /// What an image in a page or a window may have at most.
+    pub(crate) fn most_pixels(&self) -> MostPixels {
+        let limits = self.device.limits();
+        MostPixels::new(limits.max_texture_dimension_2d, limits.max_buffer_size)
     }
-    /// Encodes a frame into `out`, a texture view of the renderer's format and of any size; the image is scaled to it. Cameras of more pixels than the device can
-    /// draw are drawn with as many as it can. Nothing is waited for.
+    /// Encodes a frame into `out`, a texture view of the renderer's format and of any size; the image is scaled to it. Cameras of larger images than the textures of
+    /// the device are drawn with as many pixels as fit, in the same shape. Nothing is waited for.
     pub fn draw(&mut self, view: &View, out: &wgpu::TextureView) {
-        let most = self.most_pixels();
+        let wanted = (view.camera.width, view.camera.height);
+        let (width, height) = MostPixels { all: u64::MAX, ..self.most_pixels() }.fit(wanted);
         let fitted;
-        let view = if view.camera.width.max(view.camera.height) > most {
-            let camera = view.camera.resized(view.camera.width.min(most), view.camera.height.min(most));
-            fitted = View { camera, ..view.clone() };
+        let view = if width < wanted.0 || height < wanted.1 {
+            fitted = View { camera: view.camera.resized(width, height), ..view.clone() };
             &fitted
         } else {
             view
         };
-        let (width, height) = (view.camera.width.max(1), view.camera.height.max(1));
         if self.target.as_ref().is_none_or(|t| t.size != (width, height)) {
             if let Some(old) = self.target.take() {
                 old.destroy();
@@ -154,9 +158,16 @@ impl Renderer {
     /// Draws a frame and starts to copy it to host memory; `done` receives the 8-bit RGB image. In a browser that happens later, elsewhere when the device is polled.
     pub fn capture(&mut self, view: &View, done: impl FnOnce(Result<Image8>) + wgpu::WasmNotSend + 'static) {
         let (width, height) = (view.camera.width.max(1), view.camera.height.max(1));
-        let most = self.most_pixels();
-        if width.max(height) > most {
-            return done(Err(Error::limit("side of an image in pixels", width.max(height).into(), most.into(), "Ask for a smaller image")));
+        let limits = self.device.limits();
+        let (side, most) = (width.max(height), limits.max_texture_dimension_2d);
+        if side > most {
+            return done(Err(Error::limit("side of an image in pixels", side.into(), most.into(), "Ask for a smaller image")));
+        }
+        let row = (4 * width).next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
+        let bytes = u64::from(row) * u64::from(height);
+        if bytes > limits.max_buffer_size {
+            let object = format!("buffer for an image of {width}x{height} pixels, in bytes");
+            return done(Err(Error::limit(object, bytes, limits.max_buffer_size, "Ask for a smaller image")));
         }
         let format = self.pipelines.format;
         let size = wgpu::Extent3d { width, height, depth_or_array_layers: 1 };
@@ -172,10 +183,9 @@ impl Renderer {
             view_formats: &[],
         });
         self.draw(view, &texture.create_view(&wgpu::TextureViewDescriptor::default()));
-        let row = (4 * width).next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("capture"),
-            size: u64::from(row) * u64::from(height),
+            size: bytes,
             usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
             mapped_at_creation: false,
         });
@@ -183,6 +193,8 @@ impl Renderer {
         let layout = wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(row), rows_per_image: None };
         encoder.copy_texture_to_buffer(texture.as_image_copy(), wgpu::TexelCopyBufferInfo { buffer: &buffer, layout }, size);
         self.queue.submit([encoder.finish()]);
+        // It goes once the copy is made. A browser would keep what is only dropped until it collects garbage.
+        texture.destroy();
         let swapped = matches!(format.remove_srgb_suffix(), wgpu::TextureFormat::Bgra8Unorm);
         let read = buffer.clone();
         buffer.map_async(wgpu::MapMode::Read, .., move |mapped| {
@@ -193,6 +205,7 @@ impl Renderer {
                 Ok(Image8 { width, height, channels: 3, data })
             });
             read.unmap();
+            read.destroy();
             done(image);
         });
     }

@@ -157,6 +157,9 @@ impl Uploaded {
                 && let Ok(bytes) = buffer.get_mapped_range(..)
             {
                 let count = u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+                drop(bytes);
+                buffer.unmap();
+                buffer.destroy();
                 done(count);
             }
         });

@@ -4,10 +4,12 @@ mod capture;
 mod download;
 mod plain;
 
+use crate::render::{MostPixels, remark};
 use crate::{Clock, Content, Mode, Navigator, Renderer, Scene, View, request_device};
 use capture::Capture;
 use cc4dgs_format::{Camera, Error, Limits, StreamStage};
 use download::Download;
+use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use wasm_bindgen::prelude::*;
@@ -56,8 +58,10 @@ pub struct Player {
     output: Output,
     /// Of the canvas, in pixels.
     size: (u32, u32),
-    /// Largest side of an image in pixels.
-    most_side: u32,
+    /// What canvas and image may have at most.
+    most: MostPixels,
+    /// Whether the console has said that an image is smaller than it was to be.
+    told: Cell<bool>,
     navigator: Navigator,
     clock: Clock,
     cameras: Vec<Camera>,
@@ -71,12 +75,16 @@ pub struct Player {
 impl Player {
     /// A player that draws on `canvas` with WebGPU. Rejects where the browser has no adapter.
     pub async fn create(canvas: web_sys::HtmlCanvasElement) -> Result<Player, JsError> {
-        let (width, height) = (canvas.width().max(1), canvas.height().max(1));
+        let wanted = (canvas.width().max(1), canvas.height().max(1));
         let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
         descriptor.backends = wgpu::Backends::BROWSER_WEBGPU;
         let instance = wgpu::Instance::new(descriptor);
         let surface = instance.create_surface(wgpu::SurfaceTarget::Canvas(canvas)).map_err(error)?;
         let (adapter, device, queue) = request_device(&instance, Some(&surface)).await.map_err(error)?;
+        let limits = device.limits();
+        let most = MostPixels::new(limits.max_texture_dimension_2d, limits.max_buffer_size);
+        // A canvas that had another device may be too large for this one.
+        let (width, height) = most.fit(wanted);
         let mut configuration = surface.get_default_config(&adapter, width, height).ok_or_else(|| JsError::new("the canvas cannot be drawn on"))?;
         configuration.format = configuration.format.remove_srgb_suffix();
         surface.configure(&device, &configuration);
@@ -87,19 +95,19 @@ impl Player {
             web_sys::console::error_1(&e.to_string().into());
             first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e.to_string());
         }));
-        let most_side = device.limits().max_texture_dimension_2d;
         let renderer = Renderer::new(device, queue, configuration.format);
         let adapter = format!("{} {}", adapter.get_info().name, adapter.get_info().driver).trim().to_string();
-        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost, failure }, (width, height), most_side))
+        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost, failure }, (width, height), most))
     }
     /// A player that decodes, keeps time and navigates, for a page that draws by itself: at most `most_words` numbers per array, `most_side` pixels each way.
     pub fn plain(width: u32, height: u32, most_words: f64, most_side: u32) -> Player {
-        Self::on(Output::Plain { scene: None, most_words: most_words as u64 }, (width.max(1), height.max(1)), most_side.max(1))
+        let most = MostPixels::new(most_side, u64::MAX);
+        Self::on(Output::Plain { scene: None, most_words: most_words as u64 }, most.fit((width, height)), most)
     }
-    fn on(output: Output, size: (u32, u32), most_side: u32) -> Self {
+    fn on(output: Output, size: (u32, u32), most: MostPixels) -> Self {
         let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
         let look = View::new(navigator.camera(size.0, size.1), 0.0);
-        Self { output, size, most_side, navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
+        Self { output, size, most, told: Cell::new(false), navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
     }
     /// Opens a whole file: an archive, a PLY or an SPZ file. Returns facts as JSON.
     pub fn open(&mut self, name: &str, bytes: Vec<u8>) -> Result<String, JsError> {
@@ -150,7 +158,7 @@ impl Player {
         let seconds = presentation.seconds_of(frame_count);
         if first {
             self.navigator = Navigator::new(&presentation, lower, upper);
-            self.clock = Clock::new(frame_count, seconds);
+            self.clock = self.clock.of_other(frame_count, seconds);
         }
         (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
         self.cameras = presentation.cameras;
@@ -162,20 +170,38 @@ impl Player {
         });
         Ok(facts.to_string())
     }
-    /// Resizes the canvas' buffer to pixels.
-    pub fn resize(&mut self, width: u32, height: u32) {
-        self.size = (width.clamp(1, self.most_side), height.clamp(1, self.most_side));
+    /// Resizes the canvas' buffer to pixels, or, where that is more than can be drawn, to as many as can, in the same shape. Returns columns and rows.
+    pub fn resize(&mut self, width: u32, height: u32) -> Vec<u32> {
+        self.size = self.fitted((width.max(1), height.max(1)));
         if let Output::WebGpu { surface, configuration, renderer, .. } = &mut self.output {
             (configuration.width, configuration.height) = self.size;
             surface.configure(renderer.device(), configuration);
         }
+        vec![self.size.0, self.size.1]
+    }
+    /// Halves the number of pixels of later images, where the page had no memory for the current one; false where they are as small as images get.
+    #[wasm_bindgen(js_name = drawFewer)]
+    pub fn draw_fewer(&mut self) -> bool {
+        let fewer = self.most.fewer(self.image_size());
+        self.most = fewer.unwrap_or(self.most);
+        fewer.is_some()
+    }
+    /// The size that is drawn in place of `wanted`; the console says once that it is smaller.
+    fn fitted(&self, wanted: (u32, u32)) -> (u32, u32) {
+        let drawn = self.most.fit(wanted);
+        if let Some(remark) = remark(wanted, drawn).filter(|_| !self.told.replace(true)) {
+            web_sys::console::warn_1(&remark.into());
+        }
+        drawn
+    }
+    /// Columns and rows of the image that is scaled to the canvas.
+    fn image_size(&self) -> (u32, u32) {
+        let scaled = |side: u32| ((side as f32 * self.resolution).round() as u32).max(1);
+        self.fitted((scaled(self.size.0), scaled(self.size.1)))
     }
     fn view(&self) -> View {
-        // The same share of both sides, so that the image keeps its shape.
-        let share = self.resolution.min(self.most_side as f32 / self.size.0.max(self.size.1) as f32);
-        let scaled = |v: u32| ((v as f32 * share).round() as u32).clamp(1, self.most_side);
-        let camera = self.navigator.camera(scaled(self.size.0), scaled(self.size.1));
-        View { camera, time: self.clock.time, ..self.look.clone() }
+        let (width, height) = self.image_size();
+        View { camera: self.navigator.camera(width, height), time: self.clock.time, ..self.look.clone() }
     }
     /// The current view, or the one through `camera` (JSON) and at `time`.
     fn view_of(&self, camera: Option<String>, time: Option<f32>) -> Result<View, JsError> {
@@ -186,8 +212,8 @@ impl Player {
             view.camera.validate().map_err(error)?;
             LIMITS.check_pixels("captured image", view.camera.width.into(), view.camera.height.into()).map_err(error)?;
             let side = view.camera.width.max(view.camera.height);
-            if side > self.most_side {
-                return Err(error(Error::limit("side of an image in pixels", side.into(), self.most_side.into(), "Ask for a smaller image")));
+            if side > self.most.side {
+                return Err(error(Error::limit("side of an image in pixels", side.into(), self.most.side.into(), "Ask for a smaller image")));
             }
         }
         view.time = time.unwrap_or(view.time);

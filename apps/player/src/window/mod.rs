@@ -9,7 +9,7 @@ mod switch;
 use crate::desktop::lost::Lost;
 pub use crate::desktop::{live::Live, start::Start};
 use crate::exact::Exact;
-use crate::render::descriptor;
+use crate::render::{descriptor, remark};
 use crate::{Clock, Content, Navigator, Renderer, View};
 use cc4dgs_format::{Camera, Error, Result};
 use eframe::egui;
@@ -113,8 +113,10 @@ struct Window {
     exact: Switch,
     /// What the device or the training complained about last.
     trouble: Arc<Mutex<Option<String>>>,
-    /// What was done.
+    /// What was done, or why the image is smaller than it was to be.
     notice: Option<String>,
+    /// Whether a notice has said that the image is smaller than it was to be.
+    told: bool,
     lost: Lost,
     /// What the file holds and is not shown, and whether that was read.
     remarks: String,
@@ -165,6 +167,7 @@ impl Window {
             exact: Switch::new(Err(COPIES.to_string())),
             trouble,
             notice: None,
+            told: false,
             lost,
             remarks: String::new(),
             read: false,
@@ -209,7 +212,7 @@ impl Window {
         self.painted = None;
         if !self.loaded {
             self.navigator = Navigator::new(&presentation, lower, upper);
-            self.clock = Clock::new(frame_count, seconds);
+            self.clock = self.clock.of_other(frame_count, seconds);
         }
         (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
         let remarks = remarks.join(" ");
@@ -253,9 +256,12 @@ impl Window {
         let Some(state) = frame.wgpu_render_state() else { return };
         let scale = ui.ctx().pixels_per_point() * self.resolution;
         let available = ui.available_size();
-        let most = self.renderer.device().limits().max_texture_dimension_2d;
-        let side = |points: f32| ((points * scale).round() as u32).clamp(1, most);
-        let size = (side(available.x), side(available.y));
+        let side = |points: f32| ((points * scale).round() as u32).max(1);
+        let wanted = (side(available.x), side(available.y));
+        let size = self.renderer.most_pixels().fit(wanted);
+        if let Some(remark) = remark(wanted, size).filter(|_| !self.told) {
+            (self.told, self.notice) = (true, Some(remark));
+        }
         self.drawn = size;
         let view = self.view(size.0, size.1);
         let exact = self.exact.follow(ui.ctx(), state, &mut self.renderer, &view).unwrap_or_else(|e| {
