@@ -78,13 +78,15 @@ impl<S: Simd> Life<S> {
         let below = logit.lt(center.like(0.0));
         // A gate that is NaN stays NaN.
         let rest = unless_nan(below.select(larger, smaller), logit);
+        // So does what depends on time, where the width or the falloff is NaN: their bounds would hide it.
+        let known = unless_nan(unless_nan(rest, half_width), falloff);
         Self {
             center,
             half_width: half_width.min(most).exp(),
             falloff: falloff.min(most).exp().max(center.like(LEAST_FALLOFF)),
             gate: unless_nan(below.select(smaller, larger), logit),
             rest,
-            temporary: rest.le(center.like(LASTING)).select(center.like(0.0), rest),
+            temporary: rest.le(center.like(LASTING)).select(center.like(0.0), known),
             velocity: [x, y, z],
         }
     }

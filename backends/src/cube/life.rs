@@ -64,13 +64,19 @@ impl Life {
         // A gate that is NaN stays NaN: the exponential of NaN is any number on some devices.
         let known = is_number(logit);
         let rest = select(known, select(logit < 0.0, 1.0 - smaller, smaller), logit);
-        let temporary = select(rest <= LASTING, 0.0f32, rest);
-        let wanted = width(attributes[at + 2]);
+        // So does what depends on time, where the width or the falloff is NaN: their bounds would hide it.
+        let (log_width, log_falloff) = (attributes[at + 1], attributes[at + 2]);
+        let has_width = is_number(log_width);
+        let has_falloff = is_number(log_falloff);
+        let with_width = select(has_width, rest, log_width);
+        let with_both = select(has_falloff, with_width, log_falloff);
+        let temporary = select(rest <= LASTING, 0.0f32, with_both);
+        let wanted = width(log_falloff);
         Life {
             gate: select(known, select(logit < 0.0, smaller, 1.0 - smaller), logit),
             rest,
             temporary,
-            half_width: width(attributes[at + 1]),
+            half_width: width(log_width),
             falloff: select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF),
             falloff_is_free: wanted > LEAST_FALLOFF,
             moving: if comptime!(gated) { temporary } else { (1.0f32).runtime() },

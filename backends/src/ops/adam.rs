@@ -19,7 +19,7 @@ pub struct AdamSettings {
     pub beta1: f64,
     /// Decay of the second moment.
     pub beta2: f64,
-    /// Added to the root of the second moment.
+    /// Added to the root of the second moment; at least [`f32::MIN_POSITIVE`].
     pub epsilon: f64,
     /// Number of this step, from 1; sets the bias corrections.
     pub step: u64,
@@ -154,6 +154,15 @@ pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, g
             "Count steps from 1, keep the rate finite and the betas in [0, 1)",
         ));
     }
+    // Graphics cards may take subnormal numbers for 0.
+    let epsilon = settings.epsilon as f32;
+    if epsilon < f32::MIN_POSITIVE || !epsilon.is_finite() {
+        return Err(Error::parameter(
+            "adam",
+            format!("epsilon {:e} is {epsilon:e} in float32", settings.epsilon),
+            format!("Give a finite number of at least {:e}, such as 1e-15: without it, a step from moments of 0 is 0 / 0", f32::MIN_POSITIVE),
+        ));
+    }
     let t = settings.step as f64;
     let scalars = AdamScalars {
         beta1: settings.beta1 as f32,
@@ -162,7 +171,7 @@ pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, g
         one_minus_beta2: (1.0 - settings.beta2) as f32,
         step_size: (settings.lr / (1.0 - settings.beta1.powf(t))) as f32,
         inverse_sqrt_correction: (1.0 / (1.0 - settings.beta2.powf(t)).sqrt()) as f32,
-        epsilon: settings.epsilon as f32,
+        epsilon,
     };
     let [param, m, v, grad] = [param, m, v, grad].map(|t| t.inner().into_dispatch());
     let (param, m, v) = match settings.visible.clone() {

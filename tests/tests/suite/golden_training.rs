@@ -368,6 +368,10 @@ fn losses_and_steps_refuse_what_does_not_fit() {
     let v = |n| Tensor::<1>::zeros([n], &device);
     assert!(adam_step(v(3), v(3), v(2), v(3), &AdamSettings::new(0.1, 1)).is_err());
     assert!(adam_step(v(3), v(3), v(3), v(3), &AdamSettings::new(0.1, 0)).is_err());
+    for epsilon in [0.0, 1e-50, -1e-8, f64::INFINITY, f64::NAN] {
+        let error = adam_step(v(3), v(3), v(3), v(3), &AdamSettings { epsilon, ..AdamSettings::new(0.1, 1) }).map(|_| ()).unwrap_err().to_string();
+        assert!(error.contains("epsilon"), "{error}");
+    }
     let empty = adam_step(v(0), v(0), v(0), v(0), &AdamSettings::new(0.1, 1)).expect("no rows are fine");
     assert_eq!(empty.param.dims(), [0]);
 }

@@ -226,6 +226,25 @@ fn a_gate_that_is_nan_stays_nan() {
     }
 }
 
+/// So must a half-width or a falloff that is NaN: their bounds would make a Gaussian of it that is there at all times.
+#[test]
+fn a_width_that_is_nan_stays_nan() {
+    let row = |log_width: f32, log_falloff: f32| [0.5, log_width, log_falloff, 0.1, 0.3, -0.2, 0.1];
+    let (width, falloff) = (0.1f32.ln(), 0.2f32.ln());
+    let attributes = [row(width, falloff), row(f32::NAN, falloff), row(width, f32::NAN)].concat();
+    for (name, device) in devices() {
+        for (gated_velocity, hidden_below) in [(false, 0.01), (true, 0.01), (true, 0.0)] {
+            poison(&device);
+            let rules = LifeRules { times_norm: vec![0.5, 0.9], hidden_below, gated_velocity };
+            let input = Tensor::<2>::from_data(TensorData::new(attributes.clone(), [3, WIDTH]), &device);
+            for at in lives(input, rules).unwrap() {
+                let factors = to_vec(at.log_factor, "factors").unwrap();
+                assert!(factors[0].is_finite() && factors[1].is_nan() && factors[2].is_nan(), "{name}: {factors:?}");
+            }
+        }
+    }
+}
+
 #[test]
 fn lives_of_another_shape_are_refused() {
     let device = Device::flex();

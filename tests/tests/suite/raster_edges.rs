@@ -1,13 +1,15 @@
-//! Where rasterizers decide: colours of exactly zero, depths that are not positive once rounded, and images too long for them.
+//! Where rasterizers decide: colours of exactly zero, depths that are not positive once rounded, images too long for them. And Gaussians far larger than an
+//! image.
 
-use super::raster::{arrays, settings};
-use burn::tensor::{Tensor, TensorData};
+use super::raster::{arrays, noise, relative, settings};
+use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::cpu::raster;
 use cc4dgs_backends::ops::rasterize::RasterSettings;
+use cc4dgs_backends::rasterizers::reference::ReferenceRasterizer;
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{BLUR, Camera, Error, Gaussians, HostGaussians, Rasterizer, RenderSettings, Rules, SplatColors, Splats};
-use cc4dgs_tests::{devices, poison};
+use cc4dgs_core::{BLUR, Camera, Error, Gaussians, HostGaussians, Rasterizer, RenderSettings, Rules, Seed, SplatColors, Splats};
+use cc4dgs_tests::{devices, larger, poison};
 
 /// A Gaussian straight ahead at distance 4, where harmonics of degree 1 along z are exactly their constant.
 fn ahead(sh_dc: [f32; 3], along_z: [f32; 3]) -> (HostGaussians, Camera) {
@@ -39,7 +41,7 @@ fn a_colour_of_exactly_zero_is_not_clamped() {
         let out = TileRasterizer.render(&Splats::from_gaussians(&g, 1), &camera, &RenderSettings::default()).unwrap();
         let gradients = out.planes.clone().sum().backward();
         let image = to_vec(out.planes.inner(), "planes").unwrap();
-        let largest = |plane: usize| image[64 * plane..64 * (plane + 1)].iter().fold(0.0f32, |most, v| most.max(v.abs()));
+        let largest = |plane: usize| image[64 * plane..64 * (plane + 1)].iter().map(|v| v.abs()).fold(0.0, larger);
         assert!(largest(0) == 0.0 && largest(1) > 0.1 && largest(2) == 0.0, "{name}: {:?}", [largest(0), largest(1), largest(2)]);
         let of_dc = to_vec(g.sh_dc.grad(&gradients).unwrap(), "gradient").unwrap();
         assert!(of_dc[0] > 0.0 && of_dc[0] == of_dc[1] && of_dc[2] == 0.0, "{name}: {of_dc:?}");
@@ -106,5 +108,61 @@ fn gaussians_whose_sorted_depth_is_not_positive_are_culled() {
         assert_eq!(out.work.visible, drawn);
         assert_eq!(out.radii[0] > 0, drawn == 2, "{:?}", out.radii);
         assert!(out.radii[1] > 0 && out.planes.iter().all(|v| *v >= 0.0), "a negative depth was drawn");
+    }
+}
+
+/// Planes, and the gradient of the log-scales for random weights of the planes.
+fn drawn(rasterizer: &dyn Rasterizer, device: &Device, host: &HostGaussians, camera: &Camera, settings: &RenderSettings) -> [Vec<f32>; 2] {
+    let tracked = device.clone().autodiff();
+    let mut g = Gaussians::from_host(host, &tracked);
+    g.log_scales = g.log_scales.require_grad();
+    let out = rasterizer.render(&Splats::from_gaussians(&g, host.sh_degree), camera, settings).unwrap();
+    let shape = out.planes.dims();
+    let weights = Tensor::<3>::from_data(TensorData::new(noise(Seed::root(79), shape.iter().product()), shape), &tracked);
+    let gradients = (out.planes.clone() * weights).sum().backward();
+    [to_vec(out.planes.inner(), "planes").unwrap(), to_vec(g.log_scales.grad(&gradients).unwrap(), "gradient").unwrap()]
+}
+
+#[test]
+fn the_square_of_inria_is_as_large_as_its_gaussian() {
+    // A line across the image: its centre is 1.8e10 pixels to the right of it, three standard deviations are 1.1e11 pixels.
+    let (mut host, camera) = ahead([1.0; 3], [0.0; 3]);
+    (host.means[0], host.log_scales[0], host.opacity_logits[0]) = (1e10, 23.7, 2.0);
+    let settings = RenderSettings { rules: Rules::Inria, ..Default::default() };
+    let [truth, _] = drawn(&ReferenceRasterizer::default(), &Device::flex(), &host, &camera, &settings);
+    assert!(truth[3 * 64 + 4 * 8] > 0.5, "the reference draws nothing");
+    for (name, device) in devices() {
+        poison(&device);
+        let [planes, _] = drawn(&TileRasterizer, &device, &host, &camera, &settings);
+        let worst = planes.iter().zip(&truth).map(|(a, b)| (a - b).abs()).fold(0.0, larger);
+        assert!(worst < 1e-4, "{name}: a value differs by {worst}");
+    }
+}
+
+#[test]
+fn the_derivative_of_the_compensation_does_not_cancel_for_large_gaussians() {
+    // Standard deviations from 14,000 pixels on: the blur is less than 2e-9 of the covariance.
+    const COUNT: usize = 8;
+    let waves = |count: usize, step: f32| (0..count).map(move |k| (k as f32 * step).sin());
+    let host = HostGaussians {
+        means: waves(3 * COUNT, 1.3).map(|v| 0.3 * v).collect(),
+        log_scales: waves(3 * COUNT, 2.1).enumerate().map(|(k, v)| 9.0 + 0.08 * k as f32 + 0.3 * v).collect(),
+        quaternions: waves(4 * COUNT, 0.7).map(|v| 1.1 + v).collect(),
+        opacity_logits: vec![-1.0; COUNT],
+        sh_dc: waves(3 * COUNT, 0.9).collect(),
+        sh_rest: Vec::new(),
+        dynamic_scores: vec![0.0; COUNT],
+        sh_degree: 0,
+        ..Default::default()
+    };
+    let (_, camera) = ahead([0.0; 3], [0.0; 3]);
+    let settings = RenderSettings { antialiased: true, ..Default::default() };
+    let [_, truth] = drawn(&ReferenceRasterizer::default(), &Device::flex(), &host, &camera, &settings);
+    let wide: Vec<f64> = truth.iter().map(|&v| f64::from(v)).collect();
+    for (name, device) in devices() {
+        poison(&device);
+        let [_, found] = drawn(&TileRasterizer, &device, &host, &camera, &settings);
+        let error = relative(&found, &wide);
+        assert!(error < 2e-3, "{name}: {error:.2e}");
     }
 }

@@ -294,7 +294,9 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
     let share = p.raw_determinant * inverse;
     let alive = share.gt(like(MIN_COMPENSATION * MIN_COMPENSATION));
     let d_share = alive.keep(g.compensation * 0.5 / p.compensation) * inverse;
-    let d_raw = d_share * (like(1.0) - share);
+    // 1 - share, which would cancel where the Gaussian is much larger than the blur.
+    let of_blur = (p.covariance[0] + p.covariance[2] - camera.blur) * (inverse * camera.blur);
+    let d_raw = d_share * of_blur;
     let d_trace = -(d_share * share * camera.blur);
     let two = like(2.0);
     let d_scales: Vec3<S> = each(

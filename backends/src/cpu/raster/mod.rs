@@ -79,6 +79,8 @@ pub struct ScreenSplat {
     pub depth: f32,
     /// Half of the width in which alpha can reach 1/255, pixels.
     pub half_width: f32,
+    /// Screen radius, rounded up to whole pixels; unlike [`Forward::radii`] without an upper bound.
+    pub radius: f32,
     /// Which Gaussian it is.
     pub index: u32,
 }
@@ -115,7 +117,7 @@ fn forward_in_pool(splats: &SplatArrays, settings: &RasterSettings) -> Result<Fo
     let mut workspace = Workspace::take();
     let mut radii = vec![0i64; splats.len()];
     project::project_all(splats, settings, &camera, &rules, &mut workspace, &mut radii)?;
-    tiles::build_lists(settings, &rules, &mut workspace, &radii);
+    tiles::build_lists(settings, &rules, &mut workspace);
     let count = 5 * settings.width * settings.height;
     let mut planes = Vec::with_capacity(count);
     let pixel_pairs = blend::blend_all(splats.background, settings, &rules, &mut workspace, &mut planes.spare_capacity_mut()[..count]);

@@ -213,8 +213,7 @@ impl ProjectChunk<'_> {
     /// Adds one visible Gaussian, unless it misses Inria's square or its depth for sorting is not positive.
     #[inline(always)]
     fn emit(&mut self, offset: usize, v: &[f32; 12]) {
-        // Integer radii stay below 2^31, as in Inria's code.
-        let radius = v[11].ceil().min(1e9) as i64;
+        let radius = v[11].ceil();
         if self.rules.square_tiles && tiles::square([v[0], v[1]], radius, self.settings).iter().any(|axis| axis[0] >= axis[1]) {
             return;
         }
@@ -230,7 +229,8 @@ impl ProjectChunk<'_> {
             (last + 1 - first.min(last)) as u64
         };
         self.tiles += span(v[0], v[6], self.settings.width) * span(v[1], v[7], self.settings.height);
-        self.radii[offset] = radius;
+        // Integer radii stay below 2^31, as in Inria's code. The square has no such bound: its centre may be further than that from the image.
+        self.radii[offset] = radius.min(1e9) as i64;
         self.slots[self.count] = ScreenSplat {
             center: [v[0], v[1]],
             conic: [v[2], v[3], v[4]],
@@ -239,6 +239,7 @@ impl ProjectChunk<'_> {
             clamped: [false; 3],
             depth,
             half_width: v[6],
+            radius,
             index: index as u32,
         };
         self.footprints[self.count] = Footprint { half_height: v[7], x_of_bottom: v[8], slope: v[9], aspect: v[10] };

@@ -17,7 +17,7 @@ const AHEAD: usize = 8;
 const MOST_BITS: u32 = 13;
 
 /// Fills `ranked`, the tile lists and the record positions from the slots.
-pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, radii: &[i64]) {
+pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace) {
     let buffers = &mut **workspace;
     sort_by_depth(buffers);
     let visible = buffers.order.len();
@@ -42,20 +42,7 @@ pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: 
             // SAFETY: ranks and tasks belong to one task each.
             let (pairs, histogram, ranked, starts) =
                 unsafe { (&mut pairs.slice(task, 1)[0], histograms.slice(task * tiles, tiles), ranked.slice(first, len), starts.slice(first, len)) };
-            dispatch(Bin {
-                settings,
-                rules,
-                radii,
-                slots,
-                footprints,
-                order: &order[first..first + len],
-                first,
-                pairs,
-                histogram,
-                ranked,
-                starts,
-                rank_of_slot,
-            });
+            dispatch(Bin { settings, rules, slots, footprints, order: &order[first..first + len], first, pairs, histogram, ranked, starts, rank_of_slot });
         });
     }
     fill_lists(buffers, tiles, per_task);
@@ -65,7 +52,6 @@ pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: 
 struct Bin<'a> {
     settings: &'a RasterSettings,
     rules: &'a RuleConstants,
-    radii: &'a [i64],
     slots: &'a [ScreenSplat],
     footprints: &'a [Footprint],
     order: &'a [u64],
@@ -82,7 +68,7 @@ impl WithSimd for Bin<'_> {
     // No vectors here: the instruction set is for rounding, fused steps and the width of strips.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
-        let Self { settings, rules, radii, slots, footprints, order, first, pairs, histogram, ranked, starts, rank_of_slot } = self;
+        let Self { settings, rules, slots, footprints, order, first, pairs, histogram, ranked, starts, rank_of_slot } = self;
         pairs.clear();
         histogram.fill(0);
         for (k, key) in order.iter().enumerate() {
@@ -97,7 +83,7 @@ impl WithSimd for Bin<'_> {
             // SAFETY: a slot occurs once in the order.
             unsafe { rank_of_slot.slice(slot, 1)[0] = rank };
             starts[k] = pairs.len() as u32;
-            let limits = if rules.square_tiles { Some(square(splat.center, radii[splat.index as usize], settings)) } else { None };
+            let limits = if rules.square_tiles { Some(square(splat.center, splat.radius, settings)) } else { None };
             cut_into_tiles::<S>(
                 &splat,
                 &footprints[slot],
@@ -151,9 +137,8 @@ fn sort_by_depth(buffers: &mut Buffers) {
     }
 }
 
-/// Tile rectangle of Inria's getRect: first and end per axis. Empty if the square misses the image.
-pub fn square(center: [f32; 2], radius: i64, settings: &RasterSettings) -> [[usize; 2]; 2] {
-    let radius = radius as f32;
+/// Tile rectangle of Inria's getRect for a `radius` of whole pixels: first and end per axis. Empty if the square misses the image.
+pub fn square(center: [f32; 2], radius: f32, settings: &RasterSettings) -> [[usize; 2]; 2] {
     let axis = |center: f32, size: usize| {
         let tiles = size.div_ceil(TILE);
         // Inria counts pixels from their centres: column 0 is at 0, not at 0.5.

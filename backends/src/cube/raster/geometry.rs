@@ -234,7 +234,9 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     // Compensation^2 = raw determinant / determinant, where that is over its floor.
     let share = p.raw_determinant * inverse;
     let d_share = select(share > MIN_COMPENSATION * MIN_COMPENSATION, d_compensation * 0.5 / p.compensation, 0.0f32) * inverse;
-    let d_raw = d_share * (1.0 - share);
+    // 1 - share, which would cancel where the Gaussian is much larger than the blur.
+    let of_blur = (p.xx + p.yy - cam[BLUR]) * (inverse * cam[BLUR]);
+    let d_raw = d_share * of_blur;
     let d_trace = -(d_share * share * cam[BLUR]);
     let n = times(normal, normal);
     let raw = v3(squared.y * n.z + squared.z * n.y, squared.z * n.x + squared.x * n.z, squared.x * n.y + squared.y * n.x);
