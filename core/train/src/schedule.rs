@@ -127,8 +127,10 @@ impl StageLengths {
             trained: false,
         };
         schedule.image_scale = self.image_scale(Schedule { iteration: iteration.saturating_sub(1), ..schedule });
-        if stage == Stage::Coarse {
-            schedule.sh_degree = (iteration.saturating_sub(1) / schedule.interval(self.sh_interval, 100)).min(self.sh_degree);
+        // Degrees are added from the first iteration of a run on, whichever stage has it; a length that is settled later takes none away.
+        if stage == if self.lengths[0] > 0 { Stage::Coarse } else { Stage::Main } {
+            let interval = Schedule { total: self.total, ..schedule }.interval(self.sh_interval, 100);
+            schedule.sh_degree = (iteration.saturating_sub(1) / interval).min(self.sh_degree);
         }
         schedule
     }
@@ -212,6 +214,13 @@ mod tests {
         let full = StageLengths::new(&TrainConfig::default(), true, 1.0);
         assert_eq!((full.length(Stage::Coarse), full.length(Stage::Score), full.length(Stage::Main)), (5000, 3000, 20_000));
         let degrees: Vec<usize> = [1, 1000, 1001, 5000].iter().map(|&i| full.schedule(Stage::Coarse, i).sh_degree).collect();
+        // A run without a coarse stage begins without harmonics, too; degrees stay when its main stage becomes longer.
+        for stretch in [1.0, 1.5, 4.0] {
+            let alone = StageLengths::new(&TrainConfig { shares: [0.0, 0.0, 1.0], stretch, iterations: 14_000, ..Default::default() }, true, 1.0);
+            let degrees: Vec<usize> = (1..=alone.total()).map(|i| alone.schedule(Stage::Main, i).sh_degree).collect();
+            assert_eq!([500, 501, 1001, 1501].map(|i| degrees[i - 1]), [0, 1, 2, 3]);
+            assert!(degrees.is_sorted(), "{stretch}");
+        }
         assert_eq!(full.schedule(Stage::Coarse, 1).image_scale, 1.0);
         let growing = StageLengths::new(&TrainConfig { image_growth: 0.5, ..Default::default() }, true, 1.0);
         let scale = |stage, iteration| growing.schedule(stage, iteration).image_scale;

@@ -62,7 +62,7 @@ pub struct TrainConfig {
     pub dropout: f64,
     /// Highest spherical-harmonics degree.
     pub sh_degree: usize,
-    /// Reference iterations between two degrees.
+    /// Reference iterations between two degrees, from the start of the coarse stage, or of the main stage where there is no coarse one.
     pub sh_interval: usize,
     /// Smoothness weight at the end of its ramp (the paper's lambda_r); 0 is off.
     pub lambda_r: f32,
