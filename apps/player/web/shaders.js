@@ -107,15 +107,13 @@ void main() {
     float key = clamp((log(point.z) - frame[7].x) * frame[7].y, 0.0, 65535.0);
     color = flags.y == 1u ? depth_color(1.0 - key / 65535.0) : color_of(i, g3.xyz, normalize(mean - frame[3].xyz));
     if (flags.z == 1u && i < counts.y) color = mix(color, vec3(1.0, 0.25, 0.1), 0.65);
-    a = vec4(center, 0.5 * yy / determinant, -xy / determinant);
-    b = vec4(0.5 * xx / determinant, opacity, point.z, radius);
-    // Eigenvalues and axis take no difference of nearly equal numbers: of a long, thin footprint rounding would leave little.
-    float difference = 0.5 * (xx - yy), spread = sqrt(difference * difference + xy * xy), largest = 0.5 * (xx + yy) + spread;
-    vec2 axis = difference >= 0.0 ? vec2(spread + difference, xy) : vec2(xy, spread - difference);
-    if (dot(axis, axis) < 1e-12) axis = vec2(1.0, 0.0);
-    axis = normalize(axis);
-    vec2 side = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
-    vec2 pixel = center + side.x * sqrt(reach * largest) * axis + side.y * sqrt(reach * determinant / largest) * vec2(-axis.y, axis.x);
+    // The exponent is a sum of squares, u^2 + t^2: a dx^2 + b dx dy + c dy^2 would cancel for long, thin footprints. The sides of the quad are along u and t.
+    float root = sqrt(yy), l1 = 0.70710678 * root / sqrt(determinant);
+    a = vec4(center, l1, -(xy / yy) * l1);
+    b = vec4(0.70710678 / root, opacity, point.z, radius);
+    vec2 side = (vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0) * sqrt(0.5 * reach);
+    float dy = side.y / b.x;
+    vec2 pixel = center + vec2((side.x - a.w * dy) / a.z, dy);
     gl_Position = vec4(2.0 * pixel.x / frame[6].x - 1.0, 1.0 - 2.0 * pixel.y / frame[6].y, 0.0, 1.0);
 }`;
 
@@ -129,7 +127,7 @@ bool in_square(float pixel, float center) {
 }
 void main() {
     vec2 pixel = vec2(gl_FragCoord.x, frame[6].y - gl_FragCoord.y), d = pixel - a.xy;
-    float sigma = a.z * d.x * d.x + a.w * d.x * d.y + b.x * d.y * d.y, alpha = b.y * exp(-sigma);
+    float u = a.z * d.x + a.w * d.y, t = b.x * d.y, sigma = u * u + t * t, alpha = b.y * exp(-sigma);
     if (!(sigma >= 0.0 && alpha >= ALPHA_MIN)) discard;
     if (b.w > 0.0 && !(in_square(pixel.x, a.x) && in_square(pixel.y, a.y))) discard;
     float kept = min(alpha, frame[7].w);

@@ -1,4 +1,5 @@
-// An instanced quad per visible Gaussian, farthest first, blended over what is there. The quad is the ellipse at which alpha falls to 1/255.
+// An instanced quad per visible Gaussian, farthest first, blended over what is there. The quad is the least around the ellipse at which alpha falls to 1/255 with
+// sides along u and t, where the exponent is u^2 + t^2.
 
 struct Splat {
     a: vec4<f32>,
@@ -27,20 +28,10 @@ struct Vertex {
 fn vertex(@builtin(vertex_index) corner: u32, @builtin(instance_index) instance: u32) -> Vertex {
     // The list is nearest first.
     let splat = splats[pairs[work.visible - 1u - instance].y];
-    // The covariance is the inverse of the conic. Eigenvalues and axis take no difference of nearly equal numbers: of a long, thin footprint rounding would leave little.
-    let determinant = splat.c.w;
-    let cov = vec3<f32>(2.0 * splat.b.x, -splat.a.w, 2.0 * splat.a.z) * determinant;
-    let difference = 0.5 * (cov.x - cov.z);
-    let spread = sqrt(difference * difference + cov.y * cov.y);
-    let largest = 0.5 * (cov.x + cov.z) + spread;
-    let reach = 2.0 * (log(max(splat.b.y * 255.0, 1.0)) + 0.005);
-    let major = sqrt(reach * largest);
-    let minor = sqrt(reach * determinant / largest);
-    var axis = select(vec2<f32>(cov.y, spread - difference), vec2<f32>(spread + difference, cov.y), difference >= 0.0);
-    if (dot(axis, axis) < 1e-12) { axis = vec2<f32>(1.0, 0.0); }
-    axis = normalize(axis);
     let side = vec2<f32>(f32(corner & 1u) * 2.0 - 1.0, f32(corner >> 1u) * 2.0 - 1.0);
-    let pixel = splat.a.xy + side.x * major * axis + side.y * minor * vec2<f32>(-axis.y, axis.x);
+    let at = side * sqrt(log(max(splat.b.y * 255.0, 1.0)) + 0.005);
+    let dy = at.y / splat.b.x;
+    let pixel = splat.a.xy + vec2<f32>((at.x - splat.a.w * dy) / splat.a.z, dy);
     var out: Vertex;
     out.position = vec4<f32>(2.0 * pixel.x / frame.size.x - 1.0, 1.0 - 2.0 * pixel.y / frame.size.y, 0.5, 1.0);
     out.a = splat.a;
@@ -58,7 +49,9 @@ fn in_square(pixel: f32, center: f32, radius: f32) -> bool {
 @fragment
 fn fragment(v: Vertex) -> @location(0) vec4<f32> {
     let d = v.position.xy - v.a.xy;
-    let sigma = v.a.z * d.x * d.x + v.a.w * d.x * d.y + v.b.x * d.y * d.y;
+    let u = v.a.z * d.x + v.a.w * d.y;
+    let t = v.b.x * d.y;
+    let sigma = u * u + t * t;
     let alpha = v.b.y * exp(-sigma);
     if (!(sigma >= 0.0 && alpha >= ALPHA_MIN)) { discard; }
     if (v.b.w > 0.0 && !(in_square(v.position.x, v.a.x, v.b.w) && in_square(v.position.y, v.a.y, v.b.w))) { discard; }

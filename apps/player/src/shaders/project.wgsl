@@ -10,11 +10,11 @@ struct Gaussian {
 }
 
 struct Splat {
-    // Centre in pixels; half the first entry of the inverse covariance, and its off-diagonal entry.
+    // Centre in pixels; l1 and l2 of the exponent sigma = (l1 dx + l2 dy)^2 + (l3 dy)^2.
     a: vec4<f32>,
-    // Half its last entry, opacity, depth, radius of the square that limits it (0: none).
+    // l3, opacity, depth, radius of the square that limits it (0: none).
     b: vec4<f32>,
-    // Red, green, blue; determinant of the covariance.
+    // Red, green, blue; nothing.
     c: vec4<f32>,
 }
 
@@ -198,7 +198,10 @@ fn project(i: u32) -> bool {
         color = color_of(i, g.dc.xyz, normalize(mean - frame.center.xyz));
     }
     if (frame.flags.z == 1u && i < frame.counts.y) { color = mix(color, vec3<f32>(1.0, 0.25, 0.1), 0.65); }
-    splats[i] = Splat(vec4<f32>(center, 0.5 * yy * inverse, -xy * inverse), vec4<f32>(0.5 * xx * inverse, opacity, point.z, radius), vec4<f32>(color, determinant));
+    // A sum of squares: a dx^2 + b dx dy + c dy^2 would cancel for long, thin footprints.
+    let root = sqrt(yy);
+    let l1 = 0.70710678 * root / sqrt(determinant);
+    splats[i] = Splat(vec4<f32>(center, l1, -(xy / yy) * l1), vec4<f32>(0.70710678 / root, opacity, point.z, radius), vec4<f32>(color, 0.0));
     keys[i] = u32(key);
     return true;
 }

@@ -50,8 +50,8 @@ pub fn row_centers(origin_y: usize) -> [f32; TILE + TOGETHER - 1] {
 #[inline(always)]
 pub fn alphas<S: Simd>(simd: S, splat: &ScreenSplat, dx: Lanes<S>, centers: &[f32; TILE + TOGETHER - 1], rows: u32, out: &mut Rows<S>) {
     let like = |v: f32| Lanes::<S>::splat(simd, v);
-    let [half_a, b, half_c] = splat.conic;
-    let (a, opacity, least, limit) = (like(half_a), like(splat.opacity), like(ALPHA_MIN), like(SIGMA_MAX));
+    let [l1, l2, l3] = splat.factors;
+    let (along, opacity, least, limit) = (like(l1), like(splat.opacity), like(ALPHA_MIN), like(SIGMA_MAX));
     let mut left = rows;
     while left != 0 {
         let first = left.trailing_zeros() as usize;
@@ -61,7 +61,9 @@ pub fn alphas<S: Simd>(simd: S, splat: &ScreenSplat, dx: Lanes<S>, centers: &[f3
             #[inline(always)]
             |k| {
                 let dy = centers[k] - splat.center[1];
-                a.fma(dx, like(b * dy)).fma(dx, like(half_c * dy * dy))
+                let t = l3 * dy;
+                let u = along.fma(dx, like(l2 * dy));
+                u.fma(u, like(t * t))
             },
         );
         let shown = Lanes::exp_negated(sigma);

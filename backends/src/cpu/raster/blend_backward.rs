@@ -1,16 +1,30 @@
 //! Back-to-front derivative of blending, one tile at a time.
 //!
 //! With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i the part of the loss behind it,
-//! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = d loss / d
-//! sigma times powers of dx and dy; dx is constant per column, so its powers are applied once after the rows.
+//! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = -d loss / d
+//! sigma times powers of u and t (sigma = u^2 + t^2). Along a column these are linear in the row y, so powers of y are added up over the rows, and turned into
+//! those of u and t once. y is the offset from the row of the tile that is next to the Gaussian's centre: squares of thousands of pixels would leave nothing of the
+//! digits of v.
 
 use super::blend::{AHEAD, Gap, TOGETHER, TilePlane, alphas, column_centers, row_centers};
 use super::camera::{ALPHA_MIN, RuleConstants};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
-use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
+use super::{AT_DEPTH, RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
 use crate::cpu::simd::{Lanes, dispatch, each, prefetch, vectorized};
 use pulp::{Simd, WithSimd};
+
+/// Per column: sums of v times u, t, u^2, u t and t^2 with sigma = u^2 + t^2, from `sums` of v times 1, y and y^2. `dx` is that of the column from the Gaussian's
+/// centre, `offset` where y = 0 from it.
+#[inline(always)]
+fn moments<S: Simd>([l1, l2, l3]: [Lanes<S>; 3], dx: Lanes<S>, offset: Lanes<S>, [v, v_y, v_y2]: [Lanes<S>; 3]) -> [Lanes<S>; 5] {
+    // u and t where y = 0.
+    let (u0, t0) = (l1.fma(dx, l2 * offset), l3 * offset);
+    let (own_u, own_t) = (l2 * v_y, l3 * v_y);
+    let (u, t) = (u0.fma(v, own_u), t0.fma(v, own_t));
+    let (uu, ut, tt) = (l2 * l2 * v_y2, l2 * l3 * v_y2, l3 * l3 * v_y2);
+    [u, t, u0.fma(own_u + u, uu), u0.fma(own_t, t0.fma(u, ut)), t0.fma(own_t + t, tt)]
+}
 
 /// Fills the gradient records of all pairs from `upstream` `[5,H,W]`; with `absolute`, also the sums of absolute gradients of the centres.
 pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32], absolute: bool) {
@@ -148,7 +162,10 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                 prefetch(ranked, list[i - AHEAD].rank as usize);
             }
             let splat = &ranked[entry.rank as usize];
-            let [half_a, b, half_c] = splat.conic;
+            let [l1, l2, l3] = splat.factors;
+            let factors = splat.factors.map(like);
+            // The row of the tile that is next to the centre.
+            let nearest = splat.center[1].max(centers[0]).min(centers[TILE - 1]);
             let color: [Lanes<S>; 3] = each(
                 #[inline(always)]
                 |c| like(splat.color[c]),
@@ -164,10 +181,10 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                     continue;
                 }
                 let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
-                // Sums over rows of v, v dy and v dy^2.
+                // Sums over rows of v, v y and v y^2.
                 let mut v_sum = zero;
-                let mut v_dy = zero;
-                let mut v_dy2 = zero;
+                let mut v_y = zero;
+                let mut v_y2 = zero;
                 let mut shown = [zero; 4];
                 let (mut absolute_x, mut absolute_y) = (zero, zero);
                 alphas(simd, splat, dx, &centers, left, &mut uncapped);
@@ -175,7 +192,6 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                     let row = left.trailing_zeros() as usize;
                     left &= left - 1;
                     let at = row * TILE + first;
-                    let dy = centers[row] - splat.center[1];
                     let full = uncapped[row];
                     let mut hit = full.ge(least);
                     if STOPS {
@@ -206,46 +222,37 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                     // d alpha / d sigma = -alpha, uncapped.
                     let v = (hit & full.le(passing)).keep(full) * d_alpha;
                     if ABSOLUTE {
-                        let along_x = v * dx.fma(like(2.0 * half_a), like(b * dy));
-                        let along_y = v * dx.fma(like(b), like(2.0 * half_c * dy));
+                        // The factors 2 l1 and 2 follow after the sums.
+                        let dy = centers[row] - splat.center[1];
+                        let u = like(l1).fma(dx, like(l2 * dy));
+                        let along_x = v * u;
+                        let along_y = v * u.fma(like(l2), like(l3 * l3 * dy));
                         absolute_x += along_x.max(-along_x);
                         absolute_y += along_y.max(-along_y);
                     }
-                    let dy = like(dy);
-                    let moment = v * dy;
+                    let y = like(centers[row] - nearest);
+                    let moment = v * y;
                     v_sum += v;
-                    v_dy += moment;
-                    v_dy2 = moment.fma(dy, v_dy2);
+                    v_y += moment;
+                    v_y2 = moment.fma(y, v_y2);
                     for c in 0..3 {
                         shown[c] = weight.fma(g[c], shown[c]);
                     }
                 }
-                let v_dx = v_sum * dx;
+                let [u, t, uu, ut, tt] = moments(factors, dx, like(nearest - splat.center[1]), [v_sum, v_y, v_y2]);
                 let [red, green, blue, deep] = shown;
-                let of_block = [v_dx, v_dx * dx, v_dy, v_dy * dx, v_dy2, v_sum, red, green, blue, deep, absolute_x, absolute_y];
+                let of_block = [u, t, uu, ut, tt, v_sum, red, green, blue, deep, absolute_x, absolute_y];
                 for (sum, value) in sums.iter_mut().zip(of_block).take(if ABSOLUTE { 12 } else { 10 }) {
                     *sum += value;
                 }
             }
-            let [x, xx, y, xy, yy, v] = each(
+            // The order is that of the columns of a record.
+            records[i] = each(
                 #[inline(always)]
-                |k| sums[k].sum(),
+                |k| if k == AT_DEPTH && !DEPTH { 0.0 } else { sums[k].sum() },
             );
-            // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre. The order is that of the columns of a record.
-            records[i] = [
-                2.0 * half_a * x + b * y,
-                b * x + 2.0 * half_c * y,
-                -0.5 * xx,
-                -xy,
-                -0.5 * yy,
-                v / splat.opacity,
-                sums[6].sum(),
-                sums[7].sum(),
-                sums[8].sum(),
-                if DEPTH { sums[9].sum() } else { 0.0 },
-            ];
             if ABSOLUTE {
-                absolute_sums[i] = [sums[10].sum(), sums[11].sum()];
+                absolute_sums[i] = [2.0 * l1 * sums[10].sum(), 2.0 * sums[11].sum()];
             }
         }
     }

@@ -200,20 +200,24 @@ pub fn projection(settings: &RasterSettings, means: &[f32], quaternions: &[f32],
                 let mean: Vec3<S> = columns(simd, means, start, here);
                 let p = project(&camera, mean, columns(simd, quaternions, start, here), columns(simd, scales, start, here));
                 write(&p.center, &mut out.centers, start, here);
-                write(&p.conic, &mut out.conics, start, here);
+                let ([xx, xy, yy], [l1, l2, l3]) = (p.covariance, p.factors);
+                write(&[yy / p.determinant, -(xy / p.determinant), xx / p.determinant], &mut out.conics, start, here);
                 write(&[p.point[2]], &mut out.depths, start, here);
                 write(&[p.compensation], &mut out.compensations, start, here);
                 write(&p.covariance, &mut out.covariances, start, here);
                 let [depth] = columns(simd, upstream.depths, start, here);
                 let [compensation] = columns(simd, upstream.compensations, start, here);
+                let conic: Vec3<S> = columns(simd, upstream.conics, start, here);
+                // Sums of d loss / d sigma times dx^2, dx dy and dy^2 are 2 A, B and 2 C of this gradient.
+                let (of_x, of_y) = (conic[0] * 2.0 * l1 + conic[1] * l2, conic[1] * l1 + conic[2] * 2.0 * l2);
                 let g = ProjectionGradient {
                     center: columns(simd, upstream.centers, start, here),
-                    conic: columns(simd, upstream.conics, start, here),
+                    moments: [l1 * of_x + l2 * of_y, l3 * of_y, conic[2] * 2.0 * l3 * l3],
                     depth,
                     compensation,
                 };
                 let d = project_backward(&camera, mean, &p, &g);
-                let parts = [g.center[0], g.center[1], g.conic[0], g.conic[1], g.conic[2], depth, compensation];
+                let parts = [g.center[0], g.center[1], conic[0], conic[1], conic[2], depth, compensation];
                 let idle = parts.iter().fold(zero, |sum, v| v.fma(*v, sum)).equal(zero);
                 write(&d.mean.map(|v| idle.select(zero, v)), &mut out.d_means, start, here);
                 write(&d.quaternion.map(|v| idle.select(zero, v)), &mut out.d_quaternions, start, here);

@@ -2,10 +2,14 @@
 //!
 //! With M = R S (rotation times scales) the projected covariance is U U^T + blur, U = J W M being 2x3. The unblurred determinant is then
 //! |U0 x U1|^2 and the blurred one a sum of positive terms, so neither cancels for needles.
+//!
+//! The exponent at an offset (dx, dy) from the centre is a sum of two squares: sigma = u^2 + t^2 with u = l1 dx + l2 dy and t = l3 dy. Written as
+//! a dx^2 + b dx dy + c dy^2 it would cancel: at the end of a needle of 3,000 pixels the terms are millions of times larger than their sum.
 
 use super::camera::{CameraConstants, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE};
 use crate::cpu::simd::{Lanes, Mask, each};
 use pulp::Simd;
+use std::f32::consts::FRAC_1_SQRT_2;
 
 /// Three numbers per Gaussian.
 pub type Vec3<S> = [Lanes<S>; 3];
@@ -70,8 +74,8 @@ pub struct Projection<S: Simd> {
     pub covariance: Vec3<S>,
     /// Its determinant.
     pub determinant: Lanes<S>,
-    /// (A,B,C) of sigma = (A dx^2 + C dy^2) / 2 + B dx dy.
-    pub conic: Vec3<S>,
+    /// l1, l2, l3 of sigma = (l1 dx + l2 dy)^2 + (l3 dy)^2.
+    pub factors: Vec3<S>,
     /// sqrt(determinant before the blur / after), at least 0.005.
     pub compensation: Lanes<S>,
     /// Squared norm of the raw quaternion, rescaled where it is very short or very long.
@@ -176,6 +180,9 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
     let determinant = raw_determinant + (xx + yy).fma(like(camera.blur), like(camera.blur * camera.blur));
     let inverse = like(1.0) / determinant;
     let covariance = [xx + camera.blur, xy, yy + camera.blur];
+    // Roots before they are divided: of a huge footprint the quotients of squares would leave the range of float32.
+    let root = covariance[2].sqrt();
+    let l1 = root * FRAC_1_SQRT_2 / determinant.sqrt();
     Projection {
         point,
         center: each(
@@ -184,7 +191,7 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
         ),
         covariance,
         determinant,
-        conic: [covariance[2] * inverse, -(xy * inverse), covariance[0] * inverse],
+        factors: [l1, -(xy / covariance[2] * l1), like(FRAC_1_SQRT_2) / root],
         compensation: (raw_determinant * inverse).max(like(MIN_COMPENSATION * MIN_COMPENSATION)).sqrt(),
         norm_squared,
         unit,
@@ -205,8 +212,8 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
 pub struct ProjectionGradient<S: Simd> {
     /// d loss / d centre in pixels.
     pub center: [Lanes<S>; 2],
-    /// d loss / d (A,B,C).
-    pub conic: Vec3<S>,
+    /// Sums over pixels of d loss / d sigma times u^2, u t and t^2, where sigma = u^2 + t^2 ([`Projection::factors`]).
+    pub moments: Vec3<S>,
     /// d loss / d camera depth.
     pub depth: Lanes<S>,
     /// d loss / d compensation.
@@ -265,29 +272,36 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
         )
     };
     // The adjugate of the unblurred covariance, times the axes. A needle's covariance nearly annihilates its own axis; written with cross products, nothing
-    // cancels. With the blur and over the determinant, that is the conic K times the axes.
+    // cancels. With the blur and over the determinant, its first row is that of the conic K times the axes.
     let normal = cross(axes[0], axes[1]);
     let adjugate = [cross(by_squares(axes[1]), normal), cross(normal, by_squares(axes[0]))];
     let inverse = like(1.0) / p.determinant;
-    let seen: [Vec3<S>; 2] = each(
-        #[inline(always)]
-        |k| {
-            each(
-                #[inline(always)]
-                |j| (axes[k][j] * camera.blur + adjugate[k][j]) * inverse,
-            )
-        },
-    );
-    // d covariance = -K G K with G the symmetric gradient of the conic.
-    let half = g.conic[1] * 0.5;
-    let weighted: [Vec3<S>; 2] = [
+    // With L = ((l1, l2), (0, l3)): K = 2 L^T L and d covariance = -2 L^T Q L, where Q has the moments. L times the axes, from K times the axes.
+    let [l1, l2, l3] = p.factors;
+    let of_first = inverse * 0.5 / l1;
+    let seen: [Vec3<S>; 2] = [
         each(
             #[inline(always)]
-            |j| g.conic[0].fma(seen[0][j], half * seen[1][j]),
+            |j| (axes[0][j] * camera.blur + adjugate[0][j]) * of_first,
         ),
         each(
             #[inline(always)]
-            |j| half.fma(seen[0][j], g.conic[2] * seen[1][j]),
+            |j| axes[1][j] * l3,
+        ),
+    ];
+    let [uu, ut, tt]: Vec3<S> = each(
+        #[inline(always)]
+        |k| g.moments[k] * 2.0,
+    );
+    // 2 Q L times the axes.
+    let weighted: [Vec3<S>; 2] = [
+        each(
+            #[inline(always)]
+            |j| uu.fma(seen[0][j], ut * seen[1][j]),
+        ),
+        each(
+            #[inline(always)]
+            |j| ut.fma(seen[0][j], tt * seen[1][j]),
         ),
     ];
     // Compensation^2 = raw determinant / determinant, where that is over its floor.
@@ -306,20 +320,18 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
             // The squares of the unblurred determinant's terms with this scale, and the trace's.
             let raw = squared[k].fma(normal[l] * normal[l], squared[l] * normal[k] * normal[k]);
             let trace = axes[0][j].fma(axes[0][j], axes[1][j] * axes[1][j]);
-            let conic = seen[0][j].fma(weighted[0][j], seen[1][j] * weighted[1][j]);
-            two * p.scales[j] * d_raw.fma(raw, d_trace.fma(trace, -conic))
+            let shape = seen[0][j].fma(weighted[0][j], seen[1][j] * weighted[1][j]);
+            two * p.scales[j] * d_raw.fma(raw, d_trace.fma(trace, -shape))
         },
     );
-    let [a, b, c] = p.conic;
     let d_rows: [Vec3<S>; 2] = each(
         #[inline(always)]
         |k| {
-            let (first, second) = if k == 0 { (a, b) } else { (b, c) };
             each(
                 #[inline(always)]
                 |j| {
-                    let conic = first.fma(weighted[0][j], second * weighted[1][j]);
-                    two * p.scales[j].fma(d_raw.fma(adjugate[k][j], -conic), d_trace * p.rows[k][j])
+                    let shape = if k == 0 { l1 * weighted[0][j] } else { l2.fma(weighted[0][j], l3 * weighted[1][j]) };
+                    two * p.scales[j].fma(d_raw.fma(adjugate[k][j], -shape), d_trace * p.rows[k][j])
                 },
             )
         },

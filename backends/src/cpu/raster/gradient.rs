@@ -189,7 +189,7 @@ impl WithSimd for GradientChunk<'_> {
                     let sums = self.workspace.summed_absolute(self.workspace.rank_of_slot[slot] as usize);
                     self.out[ABSOLUTE_SCREEN][row..row + 2].copy_from_slice(&sums);
                 }
-                let record = if lane < here { self.workspace.summed_record(self.workspace.rank_of_slot[slot] as usize) } else { [0.0; RECORD] };
+                let record = if lane < here { self.workspace.summed_record(self.workspace.rank_of_slot[slot] as usize, splat) } else { [0.0; RECORD] };
                 for (row, value) in screen.iter_mut().zip(record) {
                     row[lane] = value;
                 }
@@ -266,7 +266,7 @@ impl GradientChunk<'_> {
             if antialiased {
                 d_opacity = d_opacity * p.compensation;
             }
-            let upstream = ProjectionGradient { center: [g[AT_X], g[AT_Y]], conic: [g[AT_A], g[AT_B], g[AT_C]], depth: g[AT_DEPTH], compensation };
+            let upstream = ProjectionGradient { center: [g[AT_X], g[AT_Y]], moments: [g[AT_A], g[AT_B], g[AT_C]], depth: g[AT_DEPTH], compensation };
             let mut d = project_backward(self.camera, mean, &p, &upstream);
             if space == ParameterSpace::Raw {
                 for k in 0..3 {

@@ -67,8 +67,8 @@ impl SplatArrays<'_> {
 pub struct ScreenSplat {
     /// Centre in pixels.
     pub center: [f32; 2],
-    /// A/2, B, C/2 of sigma = A/2 dx^2 + B dx dy + C/2 dy^2.
-    pub conic: [f32; 3],
+    /// l1, l2, l3 of sigma = (l1 dx + l2 dy)^2 + (l3 dy)^2.
+    pub factors: [f32; 3],
     /// Opacity, compensation included.
     pub opacity: f32,
     /// Red, green, blue.
@@ -142,5 +142,17 @@ pub fn backward(splats: &SplatArrays, settings: &RasterSettings, workspace: &mut
 /// compensation, d colour (3), d depth]).
 pub fn screen_gradients(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32]) -> Vec<(u32, [f32; RECORD])> {
     rayon::scope(|_| blend_backward::blend_backward_all(background, settings, workspace, upstream, false));
-    (0..workspace.ranked.len()).map(|rank| (workspace.ranked[rank].index, workspace.summed_record(rank))).collect()
+    let of_rank = |rank: usize| {
+        let splat = &workspace.ranked[rank];
+        let mut record = workspace.summed_record(rank, splat);
+        let [l1, l2, l3] = splat.factors.map(f64::from);
+        let [uu, ut, tt] = [record[AT_A], record[AT_B], record[AT_C]].map(f64::from);
+        // dy = t / l3 and dx = (u - l2 dy) / l1.
+        let (uy, yy) = (ut / l3, tt / (l3 * l3));
+        let xy = (uy - l2 * yy) / l1;
+        let xx = ((uu - l2 * uy) / l1 - l2 * xy) / l1;
+        (record[AT_A], record[AT_B], record[AT_C]) = ((0.5 * xx) as f32, xy as f32, (0.5 * yy) as f32);
+        (splat.index, record)
+    };
+    (0..workspace.ranked.len()).map(of_rank).collect()
 }

@@ -177,9 +177,9 @@ impl WithSimd for Project<'_, '_> {
                 let columns = [
                     p.center[0],
                     p.center[1],
-                    p.conic[0] * 0.5,
-                    p.conic[1],
-                    p.conic[2] * 0.5,
+                    p.factors[0],
+                    p.factors[1],
+                    p.factors[2],
                     opacity,
                     half_width,
                     half_height,
@@ -233,7 +233,7 @@ impl ProjectChunk<'_> {
         self.radii[offset] = radius.min(1e9) as i64;
         self.slots[self.count] = ScreenSplat {
             center: [v[0], v[1]],
-            conic: [v[2], v[3], v[4]],
+            factors: [v[2], v[3], v[4]],
             opacity: v[5],
             color: [0.0; 3],
             clamped: [false; 3],

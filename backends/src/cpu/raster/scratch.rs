@@ -105,7 +105,8 @@ pub struct Buffers {
     pub final_transmittance: Vec<f32>,
     /// Position in the list where the pixel stopped, per tile and pixel.
     pub stop_at: Vec<u32>,
-    /// Gradient records by index in `list`.
+    /// By index in `list`: sums over the pixels of a tile of v = -d loss / d sigma times u, t, u^2, u t, t^2 and 1, where sigma = u^2 + t^2, and of the blending
+    /// weight times the gradient of the colours and of the depth.
     pub records: Vec<[f32; RECORD]>,
     /// Sums of absolute gradients of the centre (x, y) by index in `list`, when asked for.
     pub absolute: Vec<[f32; 2]>,
@@ -145,16 +146,19 @@ impl Workspace {
             prefetch(&self.records, index as usize);
         }
     }
-    /// The sum of the records of the Gaussian at `rank`, in the order of its tiles.
+    /// The gradient record of `splat`, the Gaussian at `rank`, from the sum of its records, in the order of its tiles.
     #[inline(always)]
-    pub fn summed_record(&self, rank: usize) -> [f32; RECORD] {
+    pub fn summed_record(&self, rank: usize, splat: &ScreenSplat) -> [f32; RECORD] {
         let mut sum = [0.0f32; RECORD];
         for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
             for (a, b) in sum.iter_mut().zip(&self.records[index as usize]) {
                 *a += b;
             }
         }
-        sum
+        // With v = -d loss / d sigma: the signs turn here, but not for the centre, because offsets are pixel minus centre.
+        let ([l1, l2, l3], [u, t, uu, ut, tt, v, colors @ ..]) = (splat.factors, sum);
+        let [red, green, blue, depth] = colors;
+        [2.0 * l1 * u, 2.0 * (l2 * u + l3 * t), -uu, -ut, -tt, v / splat.opacity, red, green, blue, depth]
     }
     /// As [`Workspace::summed_record`], for the absolute gradients of the centre.
     pub fn summed_absolute(&self, rank: usize) -> [f32; 2] {

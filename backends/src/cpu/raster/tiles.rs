@@ -15,6 +15,8 @@ const TASKS: usize = 8;
 const AHEAD: usize = 8;
 /// Most bits of a digit of the radix sort: two digits for depths over four octaves.
 const MOST_BITS: u32 = 13;
+/// What rounding moves the edge of a footprint by, vertically, as a share of the offset of its columns' centres: some twenty roundings of float32.
+const ROUNDING: f32 = 2e-6;
 
 /// Fills `ranked`, the tile lists and the record positions from the slots.
 pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace) {
@@ -170,8 +172,9 @@ fn rows_between(splat: &ScreenSplat, foot: &Footprint, height: usize, from: usiz
     }
     let dx_bottom = foot.x_of_bottom.max(left).min(right);
     let dx_top = (-foot.x_of_bottom).max(left).min(right);
-    let bottom = (foot.slope * dx_bottom + half_column(splat, foot, dx_bottom)).min(foot.half_height);
-    let top = (foot.slope * dx_top - half_column(splat, foot, dx_top)).max(-foot.half_height);
+    let (middle_bottom, middle_top) = (foot.slope * dx_bottom, foot.slope * dx_top);
+    let bottom = (middle_bottom + (half_column(splat, foot, dx_bottom) + ROUNDING * middle_bottom.abs())).min(foot.half_height);
+    let top = (middle_top - (half_column(splat, foot, dx_top) + ROUNDING * middle_top.abs())).max(-foot.half_height);
     let last = (y + bottom - 0.5).floor();
     if last < 0.0 || last.is_nan() {
         return NONE;
@@ -287,15 +290,16 @@ mod tests {
         let size = [50, 45];
         let ([xx, xy, yy], reach) = ([30.0f32, 17.0, 14.0], 9.0f32);
         let determinant = xx * yy - xy * xy;
-        let conic = [0.5 * yy / determinant, -xy / determinant, 0.5 * xx / determinant];
+        let l1 = (0.5 * yy / determinant).sqrt();
+        let factors = [l1, -xy / yy * l1, (0.5 / yy).sqrt()];
         let half_height = (reach * yy).sqrt();
-        let splat = ScreenSplat { center: [21.3, 18.9], conic, half_width: (reach * xx).sqrt(), ..Default::default() };
+        let splat = ScreenSplat { center: [21.3, 18.9], factors, half_width: (reach * xx).sqrt(), ..Default::default() };
         let foot = Footprint { half_height, x_of_bottom: xy / yy * half_height, slope: xy / xx, aspect: determinant.sqrt() / xx };
         let mut tiles = std::collections::BTreeMap::new();
         cut_into_tiles::<S>(&splat, &foot, size, None, |tile, rows| assert!(tiles.insert(tile, Entry { rank: 0, rows }).is_none()));
         for (x, y) in (0..size[0]).flat_map(|x| (0..size[1]).map(move |y| (x, y))) {
             let [dx, dy] = [x as f32 + 0.5 - splat.center[0], y as f32 + 0.5 - splat.center[1]];
-            let sigma = conic[0] * dx * dx + conic[1] * dx * dy + conic[2] * dy * dy;
+            let sigma = (factors[0] * dx + factors[1] * dy).powi(2) + (factors[2] * dy).powi(2);
             let rows = tiles.get(&(y / TILE * size[0].div_ceil(TILE) + x / TILE)).map_or(0, |entry| entry.row_mask::<S>(x % TILE));
             assert!(2.0 * sigma > 0.999 * reach || rows >> (y % TILE) & 1 == 1, "pixel {x}, {y} is not listed");
         }

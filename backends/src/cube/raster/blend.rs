@@ -7,6 +7,8 @@ use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT
 use cubecl::prelude::*;
 
 const SIDE: u32 = TILE as u32;
+/// From the first to the last pixel centre of a row or column of a tile.
+const SPAN: f32 = TILE as f32 - 1.0;
 /// Gaussians per batch, forwards.
 const BATCH: usize = 64;
 /// Gaussians per batch, backwards. Each pixel stores two numbers per Gaussian in shared memory, so the batch is as large as that memory allows.
@@ -29,7 +31,10 @@ pub fn backward_batch(shared_bytes: usize) -> usize {
 /// Alpha of a Gaussian at an offset from its centre before its cap; 0 where it is not drawn.
 #[cube]
 fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
-    let sigma = drawn[at + AT_A] * dx * dx + drawn[at + AT_B] * dx * dy + drawn[at + AT_C] * dy * dy;
+    // A sum of squares: a dx^2 + b dx dy + c dy^2 would cancel for needles. The comparison with 0 is for NaN.
+    let u = drawn[at + AT_A] * dx + drawn[at + AT_B] * dy;
+    let t = drawn[at + AT_C] * dy;
+    let sigma = u * u + t * t;
     let alpha = drawn[at + AT_OPACITY] * (-sigma).exp();
     select(sigma >= 0.0 && alpha >= ALPHA_MIN, alpha, 0.0f32)
 }
@@ -152,7 +157,8 @@ pub fn blend_tiles(
     }
 }
 
-/// Floats of a gradient record of a pair: moments of -d loss / d sigma, weighted colours and depth; with `absolute`, the centre's absolute gradient (x, y) too.
+/// Floats of a gradient record of a pair: sums of -d loss / d sigma times u, t, u^2, u t, t^2 and 1, where sigma = u^2 + t^2, weighted colours and depth; with
+/// `absolute`, the centre's absolute gradient (x, y) too.
 pub const fn record_floats(absolute: bool) -> usize {
     if absolute { RECORD + 2 } else { RECORD }
 }
@@ -284,30 +290,48 @@ pub fn blend_tiles_backward(
         if own < count as usize {
             let at = RECORD * own;
             let dx = column - drawn[at + AT_X];
+            let center_y = drawn[at + AT_Y];
+            let (l1, l2, l3) = (drawn[at + AT_A], drawn[at + AT_B], drawn[at + AT_C]);
+            // Sums over y, from the point of the column that is next to the centre: squares of thousands of pixels would leave nothing of the digits of v.
+            let below = select(center_y > top, center_y, top);
+            let nearest = select(below < top + SPAN, below, top + SPAN);
             let mut along = 0.0f32;
             let mut square = 0.0f32;
             for k in 0..batch {
                 let pixel = k * groups + group;
-                let dy = top + (pixel / TILE) as f32 - drawn[at + AT_Y];
+                let row = top + (pixel / TILE) as f32;
+                let y = row - nearest;
                 let v = found[own * TILE_PIXELS + pixel];
                 let weight = found[(batch + own) * TILE_PIXELS + pixel];
                 sums[AT_OPACITY] += v;
-                along += v * dy;
-                square += v * dy * dy;
+                along += v * y;
+                square += v * y * y;
                 #[unroll]
                 for c in 0..4usize {
                     sums[AT_COLOR + c] += weight * of_image[c * TILE_PIXELS + pixel];
                 }
                 if comptime!(absolute) {
-                    absolute_x += (v * (2.0 * drawn[at + AT_A] * dx + drawn[at + AT_B] * dy)).abs();
-                    absolute_y += (v * (drawn[at + AT_B] * dx + 2.0 * drawn[at + AT_C] * dy)).abs();
+                    // The factors 2 l1 and 2 follow after the sums.
+                    let dy = row - center_y;
+                    let u = l1 * dx + l2 * dy;
+                    absolute_x += (v * u).abs();
+                    absolute_y += (v * (l2 * u + l3 * l3 * dy)).abs();
                 }
             }
-            sums[AT_X] = dx * sums[AT_OPACITY];
-            sums[AT_Y] = along;
-            sums[AT_A] = dx * dx * sums[AT_OPACITY];
-            sums[AT_B] = dx * along;
-            sums[AT_C] = square;
+            // u and t at that point, and the moments about it.
+            let offset = nearest - center_y;
+            let (u0, t0) = (l1 * dx + l2 * offset, l3 * offset);
+            let (own_u, own_t) = (l2 * along, l3 * along);
+            let (u, t) = (u0 * sums[AT_OPACITY] + own_u, t0 * sums[AT_OPACITY] + own_t);
+            sums[AT_X] = u;
+            sums[AT_Y] = t;
+            sums[AT_A] = l2 * l2 * square + u0 * (own_u + u);
+            sums[AT_B] = l2 * l3 * square + u0 * own_t + t0 * u;
+            sums[AT_C] = l3 * l3 * square + t0 * (own_t + t);
+            if comptime!(absolute) {
+                absolute_x *= 2.0 * l1;
+                absolute_y *= 2.0f32;
+            }
         }
         sync_cube();
         #[unroll]

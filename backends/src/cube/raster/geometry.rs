@@ -3,6 +3,7 @@
 use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
 use crate::ops::rasterize::camera::{CameraConstants, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE, RuleConstants};
 use cubecl::prelude::*;
+use std::f32::consts::FRAC_1_SQRT_2;
 
 /// Index of the translation in the camera buffer, which starts with the rotation by rows.
 pub const TRANSLATION: usize = 9;
@@ -56,7 +57,8 @@ pub struct Projected {
     pub yy: f32,
     pub determinant: f32,
     pub raw_determinant: f32,
-    pub conic: V3,
+    /// l1, l2, l3 of sigma = (l1 dx + l2 dy)^2 + (l3 dy)^2.
+    pub factors: V3,
     pub compensation: f32,
     pub norm_squared: f32,
     pub inverse_norm: f32,
@@ -162,6 +164,9 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
     let determinant = raw_determinant + (raw_xx + raw_yy) * cam[BLUR] + cam[BLUR] * cam[BLUR];
     let inverse = 1.0 / determinant;
     let (xx, yy) = (raw_xx + cam[BLUR], raw_yy + cam[BLUR]);
+    // Roots before they are divided: of a huge footprint the quotients of squares would leave the range of float32.
+    let root = yy.sqrt();
+    let l1 = FRAC_1_SQRT_2 * root / determinant.sqrt();
     let share = raw_determinant * inverse;
     let floor = MIN_COMPENSATION * MIN_COMPENSATION;
     Projected {
@@ -173,7 +178,7 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
         yy,
         determinant,
         raw_determinant,
-        conic: v3(yy * inverse, -(xy * inverse), xx * inverse),
+        factors: v3(l1, -(xy / yy * l1), FRAC_1_SQRT_2 / root),
         compensation: select(share > floor, share, floor).sqrt(),
         norm_squared,
         inverse_norm,
@@ -208,9 +213,10 @@ pub struct GeometryGradient {
     pub translation: V3,
 }
 
-/// The derivative of [`project`]: upstream of centre in pixels, of (A,B,C), of depth and of the compensation.
+/// The derivative of [`project`]: upstream of centre in pixels, of depth and of the compensation; `moments` are sums over pixels of d loss / d sigma times u^2,
+/// u t and t^2, where sigma = u^2 + t^2.
 #[cube]
-pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_y: f32, d_conic: V3, d_depth: f32, d_compensation: f32) -> GeometryGradient {
+pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_y: f32, moments: V3, d_depth: f32, d_compensation: f32) -> GeometryGradient {
     let w0 = load3(cam, 0);
     let w1 = load3(cam, 3);
     let w2 = load3(cam, 6);
@@ -220,17 +226,19 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     let axes1 = scale(add(p.turned1, scale(p.turned2, -p.ratio_y)), fz_y);
     let squared = times(s, s);
     // The adjugate of the unblurred covariance, times the axes. A needle's covariance nearly annihilates its own axis; written with cross products, nothing
-    // cancels. With the blur and over the determinant, that is the conic K times the axes.
+    // cancels. With the blur and over the determinant, its first row is that of the conic K times the axes.
     let normal = cross(axes0, axes1);
     let adjugate0 = cross(times(axes1, squared), normal);
     let adjugate1 = cross(normal, times(axes0, squared));
     let inverse = 1.0 / p.determinant;
-    let seen0 = scale(add(scale(axes0, cam[BLUR]), adjugate0), inverse);
-    let seen1 = scale(add(scale(axes1, cam[BLUR]), adjugate1), inverse);
-    // d covariance = -K G K with G the symmetric gradient of the conic.
-    let half = d_conic.y * 0.5;
-    let weighted0 = add(scale(seen0, d_conic.x), scale(seen1, half));
-    let weighted1 = add(scale(seen0, half), scale(seen1, d_conic.z));
+    // With L = ((l1, l2), (0, l3)): K = 2 L^T L and d covariance = -2 L^T Q L, where Q has the moments. L times the axes, from K times the axes.
+    let (l1, l2, l3) = (p.factors.x, p.factors.y, p.factors.z);
+    let seen0 = scale(add(scale(axes0, cam[BLUR]), adjugate0), inverse * 0.5 / l1);
+    let seen1 = scale(axes1, l3);
+    // 2 Q L times the axes.
+    let (uu, ut, tt) = (moments.x * 2.0, moments.y * 2.0, moments.z * 2.0);
+    let weighted0 = add(scale(seen0, uu), scale(seen1, ut));
+    let weighted1 = add(scale(seen0, ut), scale(seen1, tt));
     // Compensation^2 = raw determinant / determinant, where that is over its floor.
     let share = p.raw_determinant * inverse;
     let d_share = select(share > MIN_COMPENSATION * MIN_COMPENSATION, d_compensation * 0.5 / p.compensation, 0.0f32) * inverse;
@@ -241,13 +249,12 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     let n = times(normal, normal);
     let raw = v3(squared.y * n.z + squared.z * n.y, squared.z * n.x + squared.x * n.z, squared.x * n.y + squared.y * n.x);
     let trace = add(times(axes0, axes0), times(axes1, axes1));
-    let through_conic = add(times(seen0, weighted0), times(seen1, weighted1));
-    let d_scales = scale(times(s, add(add(scale(raw, d_raw), scale(trace, d_trace)), scale(through_conic, -1.0f32))), 2.0f32);
-    let (a, b, c) = (p.conic.x, p.conic.y, p.conic.z);
-    let conic0 = add(scale(weighted0, a), scale(weighted1, b));
-    let conic1 = add(scale(weighted0, b), scale(weighted1, c));
-    let d_row0 = scale(add(times(s, add(scale(adjugate0, d_raw), scale(conic0, -1.0f32))), scale(p.row0, d_trace)), 2.0f32);
-    let d_row1 = scale(add(times(s, add(scale(adjugate1, d_raw), scale(conic1, -1.0f32))), scale(p.row1, d_trace)), 2.0f32);
+    let through_shape = add(times(seen0, weighted0), times(seen1, weighted1));
+    let d_scales = scale(times(s, add(add(scale(raw, d_raw), scale(trace, d_trace)), scale(through_shape, -1.0f32))), 2.0f32);
+    let shape0 = scale(weighted0, l1);
+    let shape1 = add(scale(weighted0, l2), scale(weighted1, l3));
+    let d_row0 = scale(add(times(s, add(scale(adjugate0, d_raw), scale(shape0, -1.0f32))), scale(p.row0, d_trace)), 2.0f32);
+    let d_row1 = scale(add(times(s, add(scale(adjugate1, d_raw), scale(shape1, -1.0f32))), scale(p.row1, d_trace)), 2.0f32);
     // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]).
     let d_scaled0 = scale(d_row0, fz_x);
     let d_scaled1 = scale(d_row1, fz_y);

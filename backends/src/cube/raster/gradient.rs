@@ -49,12 +49,12 @@ pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], spl
         let to = SCREEN * i;
         if count > 0 {
             let at = RECORD * i;
-            let (half_a, b, half_c) = (splats[at + AT_A], splats[at + AT_B], splats[at + AT_C]);
-            screen[to + AT_X] = 2.0 * half_a * sums[AT_X] + b * sums[AT_Y];
-            screen[to + AT_Y] = b * sums[AT_X] + 2.0 * half_c * sums[AT_Y];
-            screen[to + AT_A] = -0.5f32 * sums[AT_A];
+            let (l1, l2, l3) = (splats[at + AT_A], splats[at + AT_B], splats[at + AT_C]);
+            screen[to + AT_X] = 2.0 * l1 * sums[AT_X];
+            screen[to + AT_Y] = 2.0 * (l2 * sums[AT_X] + l3 * sums[AT_Y]);
+            screen[to + AT_A] = -sums[AT_A];
             screen[to + AT_B] = -sums[AT_B];
-            screen[to + AT_C] = -0.5f32 * sums[AT_C];
+            screen[to + AT_C] = -sums[AT_C];
             screen[to + AT_OPACITY] = sums[AT_OPACITY] / splats[at + AT_OPACITY];
             #[unroll]
             for k in 0..4usize {
@@ -200,8 +200,8 @@ pub fn geometry_backward(
                 d_compensation = d_opacity * opacity;
                 d_opacity *= p.compensation;
             }
-            let d_conic = load3(screen, from + AT_A);
-            let d = project_backward(cam, mean, s, p, screen[from + AT_X], screen[from + AT_Y], d_conic, screen[from + AT_DEPTH], d_compensation);
+            let moments = load3(screen, from + AT_A);
+            let d = project_backward(cam, mean, s, p, screen[from + AT_X], screen[from + AT_Y], moments, screen[from + AT_DEPTH], d_compensation);
             let mut scale_x = d.scales.x;
             let mut scale_y = d.scales.y;
             let mut scale_z = d.scales.z;

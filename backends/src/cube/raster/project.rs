@@ -180,9 +180,9 @@ pub fn project_gaussians(
         let at = RECORD * i;
         splats[at + AT_X] = p.center_x;
         splats[at + AT_Y] = p.center_y;
-        splats[at + AT_A] = p.conic.x * 0.5;
-        splats[at + AT_B] = p.conic.y;
-        splats[at + AT_C] = p.conic.z * 0.5;
+        splats[at + AT_A] = p.factors.x;
+        splats[at + AT_B] = p.factors.y;
+        splats[at + AT_C] = p.factors.z;
         splats[at + AT_OPACITY] = opacity;
         splats[at + AT_DEPTH] = depth;
         let key = KEYS * i;

@@ -12,16 +12,19 @@ pub const TILE_PIXELS: usize = TILE * TILE;
 pub const MAX_TILE_PAIRS: u64 = 1 << 27;
 
 /// Columns of a screen record: what a pixel reads of a Gaussian. Gradient records have the same columns.
+///
+/// The exponent at an offset (dx, dy) from the centre is sigma = u^2 + t^2 with u = l1 dx + l2 dy and t = l3 dy. The reference writes it as
+/// (A dx^2 + C dy^2) / 2 + B dx dy instead: its records have the conic (A,B,C) in the columns of l1, l2 and l3.
 pub const RECORD: usize = 10;
 /// Column of the centre's x in pixels.
 pub const AT_X: usize = 0;
 /// Column of the centre's y in pixels.
 pub const AT_Y: usize = 1;
-/// Column of the conic's A; screen records hold A / 2.
+/// Column of l1. In gradient records: sum of d loss / d sigma times u^2; until the records of a Gaussian are summed, with the opposite sign.
 pub const AT_A: usize = 2;
-/// Column of the conic's B.
+/// Column of l2. In gradient records, likewise: u t.
 pub const AT_B: usize = 3;
-/// Column of the conic's C; screen records hold C / 2.
+/// Column of l3. In gradient records, likewise: t^2.
 pub const AT_C: usize = 4;
 /// Column of the opacity, compensation included.
 pub const AT_OPACITY: usize = 5;
