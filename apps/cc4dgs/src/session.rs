@@ -109,6 +109,9 @@ impl Session {
     }
     /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder, and a running [`Session::plan`] or
     /// [`Model::save_tuned`] to end with nothing. What begins later is not stopped. May be called from any thread.
+    ///
+    /// A program that calls it on Ctrl-C also calls `cc4dgs::train::data::answers_interrupts` first: else Ctrl-C ends an ffmpeg that decodes a video, and opening the scene
+    /// fails.
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
     }

@@ -60,7 +60,7 @@ export async function createPlayer(container, options = {}) {
 
 class Page {
     constructor(container, backend) {
-        this.backend = backend;
+        [this.container, this.backend] = [container, backend];
         this.listeners = {};
         this.gpu = null;
         this.facts = null;
@@ -355,9 +355,10 @@ class Page {
         cancelAnimationFrame(this.request);
         this.sizes?.disconnect();
         Object.values(this.listeners).forEach(listeners => listeners.clear());
-        [this.source, this.facts, this.shown, this.first] = [null, null, null, null];
+        [this.source, this.own, this.facts, this.shown, this.first] = [null, null, null, null, null];
         release(this);
         this.ui.remove();
+        if (players.get(this.container) === this) players.delete(this.container);
     }
     // Images and links
     async capture(camera, time) {

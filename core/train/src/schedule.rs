@@ -127,7 +127,7 @@ impl StageLengths {
             trained: false,
         };
         schedule.image_scale = self.image_scale(Schedule { iteration: iteration.saturating_sub(1), ..schedule });
-        // Degrees are added from the first iteration of a run on, whichever stage has it; a length that is settled later takes none away.
+        // Degrees are added from the start of the coarse stage on, or of the main stage without one; a length that is settled later takes none away.
         if stage == if self.lengths[0] > 0 { Stage::Coarse } else { Stage::Main } {
             let interval = Schedule { total: self.total, ..schedule }.interval(self.sh_interval, 100);
             schedule.sh_degree = (iteration.saturating_sub(1) / interval).min(self.sh_degree);

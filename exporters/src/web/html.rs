@@ -33,16 +33,19 @@ try {
 /// Longest text that a browser (V8) holds, in characters.
 const MOST_TEXT: usize = (1 << 29) - 24;
 
-/// Says what would leave the page blank: browsers without import maps or `DecompressionStream`, and files that end before the script that starts the player.
+/// Says what would leave the page blank: browsers without import maps or `DecompressionStream`, and files that end before the end of the script that starts the player.
 const BLANK: &str = r#"<script>
 if (!window.DecompressionStream || !HTMLScriptElement.supports || !HTMLScriptElement.supports("importmap")) document.getElementById("player").textContent =
     "This page needs a newer browser: Chrome or Edge 96, Firefox 113, Safari 16.4, or later.";
 else document.addEventListener("DOMContentLoaded", () => {
-    if (!document.getElementById("start")) document.getElementById("player").textContent =
+    if (!document.getElementById("end")) document.getElementById("player").textContent =
         "This file is not complete: its end is missing. Download or copy it again; where that does not help, export it again.";
 });
 </script>
 "#;
+
+/// What a complete file has behind the script that starts the player: a script without its end is not run.
+const END: &str = "<i id=\"end\" hidden></i>\n";
 
 /// `text` with the special characters of HTML escaped.
 fn escaped(text: &str) -> String {
@@ -138,6 +141,7 @@ pub(super) fn single(page: &Page, title: &str, archive: &[u8], autoplay: bool) -
         data("renderer", "text/plain", &STANDARD.encode(packed)),
         data("model", "text/plain", &STANDARD.encode(archive)),
         data("start", "module", &format!("\n{START}\n")),
+        END.to_string(),
     ];
     Ok(document(title, &head, &body.concat()))
 }
@@ -169,9 +173,11 @@ mod tests {
         let html = single(&page(), "t", b"archive", true).unwrap();
         let (said, model) = (html.find("its end is missing").unwrap(), html.find(r#"id="model""#).unwrap());
         assert!(said < model, "the script that says so is cut off, too");
-        // It looks for the script that starts the player, which is the last.
+        // It looks for what is behind the script that starts the player, which is the last.
         let start = html.find(r#"<script type="module" id="start">"#).unwrap();
-        assert!(html[..said].contains(r#"getElementById("start")"#) && start > model && html[start..].matches("<script").count() == 1, "{html}");
+        assert!(start > model && html[start..].matches("<script").count() == 1, "{html}");
+        let end = html.rfind("</script>").unwrap();
+        assert!(html[..said].contains(r#"getElementById("end")"#) && html[end..].contains(r#"id="end""#) && !html[..end].contains(r#"id="end""#), "{html}");
         let (tries, says) = (html[start..].find("try {").unwrap(), html[start..].find("could not be started (${e.message})").unwrap());
         assert!(["import(\"cc4dgs/player.js\")", "bytes(\"renderer\")", "bytes(\"model\")"].iter().all(|work| {
             let at = html[start..].find(work).unwrap();

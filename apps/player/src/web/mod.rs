@@ -58,8 +58,10 @@ pub struct Player {
     output: Output,
     /// Of the canvas, in pixels.
     size: (u32, u32),
-    /// What canvas and image may have at most.
+    /// What the canvas may have at most.
     most: MostPixels,
+    /// What an image may have at most: less than that where there was no memory for one.
+    most_drawn: MostPixels,
     /// Whether the console has said that an image is smaller than it was to be.
     told: Cell<bool>,
     navigator: Navigator,
@@ -107,7 +109,7 @@ impl Player {
     fn on(output: Output, size: (u32, u32), most: MostPixels) -> Self {
         let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
         let look = View::new(navigator.camera(size.0, size.1), 0.0);
-        Self { output, size, most, told: Cell::new(false), navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
+        Self { output, size, most, most_drawn: most, told: Cell::new(false), navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
     }
     /// Opens a whole file: an archive, a PLY or an SPZ file. Returns facts as JSON.
     pub fn open(&mut self, name: &str, bytes: Vec<u8>) -> Result<String, JsError> {
@@ -172,7 +174,7 @@ impl Player {
     }
     /// Resizes the canvas' buffer to pixels, or, where that is more than can be drawn, to as many as can, in the same shape. Returns columns and rows.
     pub fn resize(&mut self, width: u32, height: u32) -> Vec<u32> {
-        self.size = self.fitted((width.max(1), height.max(1)));
+        self.size = self.fitted(self.most, (width.max(1), height.max(1)));
         if let Output::WebGpu { surface, configuration, renderer, .. } = &mut self.output {
             (configuration.width, configuration.height) = self.size;
             surface.configure(renderer.device(), configuration);
@@ -182,13 +184,13 @@ impl Player {
     /// Halves the number of pixels of later images, where the page had no memory for the current one; false where they are as small as images get.
     #[wasm_bindgen(js_name = drawFewer)]
     pub fn draw_fewer(&mut self) -> bool {
-        let fewer = self.most.fewer(self.image_size());
-        self.most = fewer.unwrap_or(self.most);
+        let fewer = self.most_drawn.fewer(self.image_size());
+        self.most_drawn = fewer.unwrap_or(self.most_drawn);
         fewer.is_some()
     }
-    /// The size that is drawn in place of `wanted`; the console says once that it is smaller.
-    fn fitted(&self, wanted: (u32, u32)) -> (u32, u32) {
-        let drawn = self.most.fit(wanted);
+    /// The size that is drawn where `wanted` is asked for, `most` at most; the console says once that it is smaller.
+    fn fitted(&self, most: MostPixels, wanted: (u32, u32)) -> (u32, u32) {
+        let drawn = most.fit(wanted);
         if let Some(remark) = remark(wanted, drawn).filter(|_| !self.told.replace(true)) {
             web_sys::console::warn_1(&remark.into());
         }
@@ -197,7 +199,7 @@ impl Player {
     /// Columns and rows of the image that is scaled to the canvas.
     fn image_size(&self) -> (u32, u32) {
         let scaled = |side: u32| ((side as f32 * self.resolution).round() as u32).max(1);
-        self.fitted((scaled(self.size.0), scaled(self.size.1)))
+        self.fitted(self.most_drawn, (scaled(self.size.0), scaled(self.size.1)))
     }
     fn view(&self) -> View {
         let (width, height) = self.image_size();

@@ -3,7 +3,7 @@
 //! With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i the part of the loss behind it,
 //! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = -d loss / d
 //! sigma times powers of u and t (sigma = u^2 + t^2). Along a column these are linear in the row y, so powers of y are added up over the rows, and turned into
-//! those of u and t once. y is the offset from the row of the tile that is next to the Gaussian's centre: squares of thousands of pixels would leave nothing of the
+//! those of u and t once. y is the offset from the point of the column that is next to the Gaussian's centre: squares of thousands of pixels would leave nothing of the
 //! digits of v.
 
 use super::blend::{AHEAD, Gap, TOGETHER, TilePlane, alphas, column_centers, row_centers};
@@ -164,7 +164,7 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
             let splat = &ranked[entry.rank as usize];
             let [l1, l2, l3] = splat.factors;
             let factors = splat.factors.map(like);
-            // The row of the tile that is next to the centre.
+            // The y of the tile's columns that is next to the centre.
             let nearest = splat.center[1].max(centers[0]).min(centers[TILE - 1]);
             let color: [Lanes<S>; 3] = each(
                 #[inline(always)]
@@ -172,7 +172,7 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
             );
             let depth = like(splat.depth);
             let position = like(f32::from_bits(i as u32 + 1));
-            // Sums over pixels of v times x, x^2, y, x y, y^2 and 1, of weight times upstream colour and depth, and of absolute gradients.
+            // Sums over pixels of v times u, t, u^2, u t, t^2 and 1, of weight times upstream colour and depth, and of absolute gradients.
             let mut sums = [zero; 12];
             for block in 0..TILE / S::F32_LANES {
                 let first = block * S::F32_LANES;

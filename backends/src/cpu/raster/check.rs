@@ -200,8 +200,8 @@ pub fn projection(settings: &RasterSettings, means: &[f32], quaternions: &[f32],
                 let mean: Vec3<S> = columns(simd, means, start, here);
                 let p = project(&camera, mean, columns(simd, quaternions, start, here), columns(simd, scales, start, here));
                 write(&p.center, &mut out.centers, start, here);
-                let ([xx, xy, yy], [l1, l2, l3]) = (p.covariance, p.factors);
-                write(&[yy / p.determinant, -(xy / p.determinant), xx / p.determinant], &mut out.conics, start, here);
+                let [l1, l2, l3] = p.factors;
+                write(&[l1 * l1 * 2.0, l1 * l2 * 2.0, (l2 * l2 + l3 * l3) * 2.0], &mut out.conics, start, here);
                 write(&[p.point[2]], &mut out.depths, start, here);
                 write(&[p.compensation], &mut out.compensations, start, here);
                 write(&p.covariance, &mut out.covariances, start, here);

@@ -212,7 +212,9 @@ impl Suite<'_> {
             leaves = Leaves { planes: leaves.planes.require_grad(), gaussians: tracked(leaves.gaussians), canonical: tracked(leaves.canonical) };
         }
         let radii = Tensor::<1, Int>::ones([inputs.gaussians.len()], self.device);
-        let camera = Camera::look_at("conformance", (w as u32, h as u32), 1.0, [1.0, -2.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        // One focal length whatever the size: values may depend on it.
+        let fov = 2.0 * (w as f64 / SIZE[1] as f64 * 0.5f64.tan()).atan();
+        let camera = Camera::look_at("conformance", (w as u32, h as u32), fov, [1.0, -2.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let (view, schedule) = (View { camera: 0, frame: 4, time_norm: 0.4, split: Split::Train }, Schedule::main(100));
         let Leaves { planes, gaussians, canonical } = &leaves;
         let input = LossInput::new(&camera, &view, planes, &target, gaussians, &radii, &schedule).moved_from(canonical);

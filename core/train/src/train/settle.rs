@@ -24,7 +24,7 @@ impl Context<'_> {
     pub(crate) fn settle(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let most_px = self.job.config.train.settle;
         let Moving::Scored { zeta } = state.moving else { return Ok(()) };
-        if most_px <= 0.0 || schedule.stage != Stage::Main || !is_due(schedule, self.job.config.train.time_ramp) {
+        if most_px <= 0.0 || schedule.stage != Stage::Main || !is_due(schedule, self.time_ramp()) {
             return Ok(());
         }
         let rows = state.moving_rows(&self.device)?;

@@ -60,6 +60,8 @@ impl Context<'_> {
         let mut log = Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
         // That of the state that the watchdog remembers.
         let mut log_of_good = log.record();
+        // The iteration of the checkpoint on disk.
+        let mut saved = resumed_at;
         while state.iteration < self.lengths.length(stage) {
             // A main stage that has begun and has no iteration would begin again, key frames included, when it is resumed.
             if (state.iteration > 0 || stage != Stage::Main) && self.job.stop.load(Ordering::Relaxed) {
@@ -97,7 +99,7 @@ impl Context<'_> {
             let trouble = self.saved_if_resumable(stepped, state)?;
             if trouble.is_none() {
                 let changed = self.change_gaussians(state, &schedule);
-                self.good_saved_before_error(changed, &watchdog, log_of_good, state)?;
+                self.good_saved_before_error(changed, &watchdog, (log_of_good, saved), state)?;
             }
             state.iteration = schedule.iteration;
             watchdog.after_iteration(self, state, trouble, length, saves)?;
@@ -113,13 +115,13 @@ impl Context<'_> {
                 factor.map_or(Ok(()), |factor| self.stretch_main(factor))?;
             }
             let watched = watch.after_iteration(self, state, &schedule);
-            if let Some(failure) = self.good_saved_before_error(watched, &watchdog, log_of_good, state)? {
+            if let Some(failure) = self.good_saved_before_error(watched, &watchdog, (log_of_good, saved), state)? {
                 state.record.log = log.record();
                 self.save(state)?;
                 return Err(failure);
             }
             let validated = self.validate(state, &schedule);
-            self.good_saved_before_error(validated, &watchdog, log_of_good, state)?;
+            self.good_saved_before_error(validated, &watchdog, (log_of_good, saved), state)?;
             self.observe(state, &schedule, batch.len())?;
             if watchdog.remember(state, length) {
                 log_of_good = log.record();
@@ -127,6 +129,7 @@ impl Context<'_> {
             if saves {
                 state.record.log = log.record();
                 self.save(state)?;
+                saved = state.iteration;
             }
         }
         log.finish(events);
@@ -157,11 +160,18 @@ impl Context<'_> {
     pub(super) fn sampler(&self, schedule: &Schedule) -> Sampler {
         let (train, stage) = (&self.job.config.train, schedule.stage);
         let sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), train.views_per_iteration(stage));
-        // Only a canonical space that is the first frame can be left frame by frame.
-        if stage != Stage::Main || self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len() {
+        let ramp = self.time_ramp();
+        if stage != Stage::Main || ramp == 0.0 {
             return sampler;
         }
-        sampler.with_ramp(|share| schedule.iteration_at(share * train.time_ramp), |view| self.job.scene.views[view].time_norm)
+        sampler.with_ramp(|share| schedule.iteration_at(share * ramp), |view| self.job.scene.views[view].time_norm)
+    }
+
+    /// The share of the main stage in which frames come in one after another, from the first on. 0 where the canonical space is not the first frame: only that can be
+    /// left frame by frame.
+    pub(super) fn time_ramp(&self) -> f64 {
+        let all_at_once = self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len();
+        if all_at_once { 0.0 } else { self.job.config.train.time_ramp }
     }
 
     /// The training views a stage draws from.
@@ -247,9 +257,10 @@ impl Context<'_> {
         if resumable { self.saved_before_error(result, state) } else { result }
     }
 
-    /// As [`Context::saved_before_error`], in the middle of an iteration: the checkpoint is that of the state that `watchdog` remembers, where the log was `log`.
-    fn good_saved_before_error<T>(&self, result: Result<T>, watchdog: &Watchdog, log: LogRecord, state: &mut TrainState) -> Result<T> {
-        if is_lost_image(&result) && watchdog.return_to_good(self, state).is_ok() {
+    /// As [`Context::saved_before_error`], in the middle of an iteration: the checkpoint is that of the state that `watchdog` remembers, where the log was `log`, unless
+    /// the one on disk, of the iteration `saved`, is newer.
+    fn good_saved_before_error<T>(&self, result: Result<T>, watchdog: &Watchdog, (log, saved): (LogRecord, usize), state: &mut TrainState) -> Result<T> {
+        if is_lost_image(&result) && watchdog.return_to_good(self, state).is_ok() && state.iteration >= saved {
             state.record.log = log;
             return self.saved_if_resumable(result, state);
         }

@@ -52,7 +52,7 @@ pub fn end_commands() {
 #[cfg(unix)]
 fn ask_to_end(id: u32) {
     // A process that has just ended cannot be asked.
-    Command::new("kill").arg(id.to_string()).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status().ok();
+    Command::new("sh").args(["-c", "kill \"$0\"", &id.to_string()]).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status().ok();
 }
 
 /// Ctrl-C reaches them there.
