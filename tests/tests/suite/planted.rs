@@ -83,7 +83,7 @@ impl Deformer for Velocities {
 
 #[derive(serde::Deserialize)]
 #[serde(deny_unknown_fields)]
-struct NoSettings {}
+pub(super) struct NoSettings {}
 
 type Build = fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>;
 

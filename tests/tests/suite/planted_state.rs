@@ -1,6 +1,7 @@
 //! Errors with state that conformance suites must find: deformers that remember their last input or mix Gaussians, density controls that count on making all plans,
 //! and an optimizer in which new rows keep the momentum of others.
 
+use super::planted::NoSettings;
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
@@ -54,10 +55,6 @@ impl Deformer for Velocities {
         Vec::new()
     }
 }
-
-#[derive(serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-struct NoSettings {}
 
 fn build_velocities(mistake: Mistake, settings: &toml::Table) -> Result<Box<dyn Deformer>> {
     let NoSettings {} = config::parse_section("deformer velocities", settings)?;

@@ -13,6 +13,7 @@ use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage, start_deformer};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
@@ -241,14 +242,20 @@ impl Context<'_> {
     pub(super) fn saved_before_error<T>(&self, result: Result<T>, state: &mut TrainState) -> Result<T> {
         let learned = state.iteration > 0 || (state.stage > Stage::Coarse && self.lengths.length(Stage::Coarse) > 0);
         if let Some(path) = self.checkpoint.as_ref().filter(|_| learned && is_lost_image(&result)) {
-            let at = format!("iteration {} of stage {}", state.iteration, state.stage.name());
-            let message = match self.save(state) {
-                Ok(()) => format!("an image cannot be read; everything until {at} is in {}, --resume continues", path.display()),
-                Err(error) => format!("an image cannot be read, and what was learned until {at} is lost: {error}"),
-            };
-            self.job.events.emit(&Event::Warning { object: "training".into(), message });
+            let saved = self.save(state);
+            self.warn_of_lost_image(path, saved, state.iteration, state.stage);
         }
         result
+    }
+
+    /// Warns that an image cannot be read, and says where the checkpoint `path` of an iteration is, or why it could not be written.
+    fn warn_of_lost_image(&self, path: &Path, saved: Result<()>, iteration: usize, stage: Stage) {
+        let at = format!("iteration {iteration} of stage {}", stage.name());
+        let message = match saved {
+            Ok(()) => format!("an image cannot be read; everything until {at} is in {}, --resume continues", path.display()),
+            Err(error) => format!("an image cannot be read, and what was learned until {at} is lost: {error}"),
+        };
+        self.job.events.emit(&Event::Warning { object: "training".into(), message });
     }
 
     /// As [`Context::saved_before_error`], but for a main stage that has its key frames and no iteration: it would get them again when it is resumed.
@@ -260,11 +267,15 @@ impl Context<'_> {
     /// As [`Context::saved_before_error`], in the middle of an iteration: the checkpoint is that of the state that `watchdog` remembers, where the log was `log`, unless
     /// the one on disk, of the iteration `saved`, is newer.
     fn good_saved_before_error<T>(&self, result: Result<T>, watchdog: &Watchdog, (log, saved): (LogRecord, usize), state: &mut TrainState) -> Result<T> {
-        if is_lost_image(&result) && watchdog.return_to_good(self, state).is_ok() && state.iteration >= saved {
-            state.record.log = log;
-            return self.saved_if_resumable(result, state);
+        if !is_lost_image(&result) || watchdog.return_to_good(self, state).is_err() {
+            return result;
         }
-        result
+        if let Some(path) = self.checkpoint.as_ref().filter(|_| state.iteration < saved) {
+            self.warn_of_lost_image(path, Ok(()), saved, state.stage);
+            return result;
+        }
+        state.record.log = log;
+        self.saved_if_resumable(result, state)
     }
 
     /// Writes the checkpoint, where the run has a folder.
