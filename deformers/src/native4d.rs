@@ -9,8 +9,8 @@ use crate::parts::centres::check_time;
 use crate::parts::settings::{not_negative, within};
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures,
-    SpatialInput, config, inventory,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SPACE_TIME_ATTRIBUTES,
+    SpatialFeatures, SpatialInput, config, inventory,
 };
 use serde::Deserialize;
 use std::f32::consts::TAU;
@@ -19,14 +19,15 @@ const SCHEMA: &str = "\
 duration = 0.1414        # standard deviation in time of a new Gaussian, as a share of the sequence (published: sqrt(2) of 10 s on N3DV; sqrt(s / 5) of s seconds)
 hidden_below = 0.05      # a Gaussian whose opacity factor is below this is hidden
 harmonics = 2            # number of cosines of time by which colours change (4D spherical harmonics); 0 for constant colours
+harmonics_every = 0.0    # cosines are used one after the other at this share of the main stage, after the degrees of colours; 0: all from the start
 time_lr = 1.6e-5         # Adam on the centre in time, times the extent of the cameras in the normalised frame (published: 1.6e-4 of seconds; 10 s on N3DV)
 duration_lr = 5e-3       # Adam on the logarithm of the duration
 velocity_lr = 1e-3       # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
 color_lr = 1.25e-4       # Adam on the cosines' coefficients
 ";
 
-/// Names of the attributes, in order.
-const NAMES: [&str; 4] = ["time_center", "log_duration", "velocity", "sh_time"];
+/// Name of the cosines' coefficients, the last attribute after [`SPACE_TIME_ATTRIBUTES`].
+const COLORS: &str = "sh_time";
 /// Logarithm of the opacity factor of a hidden Gaussian.
 const HIDDEN: f32 = -30.0;
 /// Largest absolute logarithm of a duration: beyond it, quotients and their derivatives are not finite.
@@ -38,6 +39,7 @@ struct Settings {
     duration: f32,
     hidden_below: f32,
     harmonics: usize,
+    harmonics_every: f32,
     time_lr: f64,
     duration_lr: f64,
     velocity_lr: f64,
@@ -46,15 +48,27 @@ struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { duration: 0.1414, hidden_below: 0.05, harmonics: 2, time_lr: 1.6e-5, duration_lr: 5e-3, velocity_lr: 1e-3, color_lr: 1.25e-4 }
+        Self {
+            duration: 0.1414,
+            hidden_below: 0.05,
+            harmonics: 2,
+            harmonics_every: 0.0,
+            time_lr: 1.6e-5,
+            duration_lr: 5e-3,
+            velocity_lr: 1e-3,
+            color_lr: 1.25e-4,
+        }
     }
 }
 
 /// It has no weights: everything learned is an attribute of Gaussians.
 struct Native4d {
     settings: Settings,
-    /// Coefficients of the spherical harmonics per channel.
+    /// Degree of the spherical harmonics, and their coefficients per channel.
+    degree: usize,
     basis: usize,
+    /// How many cosines are used yet.
+    open: usize,
 }
 
 impl Native4d {
@@ -69,7 +83,11 @@ impl Native4d {
         if !(0.0..1.0).contains(&settings.hidden_below) {
             return bad("hidden_below", settings.hidden_below, "Give a factor from 0 to below 1");
         }
-        Ok(Self { settings, basis: (context.sh_degree + 1).pow(2) })
+        if !(0.0..=1.0).contains(&settings.harmonics_every) {
+            return bad("harmonics_every", settings.harmonics_every, "Give a share of the main stage, such as 0.033, or 0 for all cosines from the start");
+        }
+        let degree = context.sh_degree;
+        Ok(Self { open: settings.harmonics, settings, degree, basis: (degree + 1).pow(2) })
     }
     /// Columns of the features that belong to each attribute.
     fn widths(&self) -> [usize; 4] {
@@ -83,7 +101,8 @@ impl Deformer for Native4d {
         // Initial centres in time reach a tenth of the sequence beyond either end, as in the published code.
         let starts = [(0.5, 0.6), (s.duration.ln(), 0.0), (0.0, 0.0), (0.0, 0.0)];
         let rates = [(s.time_lr, true), (s.duration_lr, false), (s.velocity_lr, true), (s.color_lr, false)];
-        let all = NAMES.into_iter().zip(self.widths()).zip(starts).zip(rates);
+        let names = SPACE_TIME_ATTRIBUTES.map(|(name, _)| name).into_iter().chain([COLORS]);
+        let all = names.zip(self.widths()).zip(starts).zip(rates);
         all.filter(|(((_, width), _), _)| *width > 0)
             .map(|(((name, width), (start, spread)), (lr, times_extent))| AttributeSpec { spread, times_extent, ..AttributeSpec::new(name, width, start, lr) })
             .collect()
@@ -104,8 +123,8 @@ impl Deformer for Native4d {
         let sh = (self.settings.harmonics > 0).then(|| {
             let width = 3 * self.basis;
             let wave = |n: usize| part(5 + (n - 1) * width, width) * since.clone().mul_scalar(TAU * n as f32).cos();
-            let first = wave(1);
-            (2..=self.settings.harmonics).fold(first, |sum, n| sum + wave(n)).reshape([m, self.basis, 3])
+            let sum = (1..=self.open).map(wave).reduce(|sum, next| sum + next);
+            sum.unwrap_or_else(|| Tensor::zeros([m, width], &features.device())).reshape([m, self.basis, 3])
         });
         Ok(Offsets { means: Some(part(2, 3) * since.clone()), opacity_log_factor: Some(factor.mask_fill(hidden, HIDDEN)), sh, ..Offsets::default() })
     }
@@ -117,6 +136,12 @@ impl Deformer for Native4d {
     }
     fn groups(&self) -> Vec<ParameterGroup> {
         Vec::new()
+    }
+    fn set_progress(&mut self, progress: f32) {
+        let (every, all) = (self.settings.harmonics_every, self.settings.harmonics);
+        // Those of the first degrees of colours are counted, too. All are used at the end, however long the interval.
+        let steps = if every > 0.0 && progress < 1.0 { (progress / every) as usize } else { usize::MAX };
+        self.open = steps.saturating_sub(self.degree).min(all);
     }
 }
 
@@ -144,6 +169,20 @@ mod tests {
     use burn::tensor::TensorData;
     use cc4dgs_core::Seed;
     use cc4dgs_core::gaussians::to_vec;
+
+    #[test]
+    fn cosines_follow_the_degrees_of_colours() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 1, seed: Seed::root(2) };
+        let mut field = Native4d::new(Settings { harmonics_every: 0.1, ..Settings::default() }, &context).unwrap();
+        let features = Tensor::<2>::ones([1, field.widths().iter().sum()], &Device::flex());
+        let mut color = |progress: Option<f32>| {
+            progress.iter().for_each(|&progress| field.set_progress(progress));
+            field.deform(features.clone(), 1.0).unwrap().sh.map_or(0.0, |sh| to_vec(sh, "colours").unwrap()[0])
+        };
+        // At its own time every cosine is 1. A model that is only played has all of them.
+        assert_eq!([None, Some(0.01), Some(0.15), Some(0.25), Some(0.35), Some(1.0), Some(0.15)].map(&mut color), [2.0, 0.0, 0.0, 1.0, 2.0, 2.0, 0.0]);
+        assert!(Native4d::new(Settings { harmonics_every: f32::NAN, ..Settings::default() }, &context).is_err());
+    }
 
     #[test]
     fn extreme_durations_have_finite_factors_and_gradients() {

@@ -53,7 +53,7 @@ pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, Row
 pub use depth::DepthImage;
 pub use device::{DEVICE_NAMES, parse_device, resolved_device};
 pub use gaussians::Gaussians;
-pub use life::{LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, gate_value};
+pub use life::{LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, SPACE_TIME_ATTRIBUTES, gate_value};
 pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};
 pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;

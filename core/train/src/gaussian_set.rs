@@ -1,4 +1,5 @@
-//! The Gaussians under optimisation: every attribute is an array `[N, width]` by name, so that growing, pruning, checkpoints and attributes of plug-ins need no list of names.
+//! The Gaussians under optimisation: every attribute is an array `[N, width]` by name, so that growing, pruning, checkpoints and attributes of plug-ins need no
+//! list of names.
 
 use crate::config::GaussianRates;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -123,8 +124,12 @@ impl Leaves {
 pub fn gaussian_rate(rates: &GaussianRates, name: &str, schedule: &Schedule) -> f64 {
     match name {
         "means" => {
-            let way = if schedule.stage == Stage::Coarse { rates.coarse_decay } else { 1.0 };
-            log_linear(rates.means, rates.means_end, way * schedule.progress()) * f64::from(schedule.extent)
+            let progress = schedule.progress();
+            let way = match schedule.stage {
+                Stage::Coarse => rates.coarse_decay * progress,
+                _ => rates.main_decay + (1.0 - rates.main_decay) * (progress / rates.main_until).min(1.0),
+            };
+            log_linear(rates.means, rates.means_end, way) * f64::from(schedule.extent)
         }
         "log_scales" => rates.log_scales,
         "quaternions" => rates.quaternions,

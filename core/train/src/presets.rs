@@ -70,7 +70,8 @@ methods! {
 #[cfg(test)]
 mod tests {
     use crate::config::RunConfig;
-    use cc4dgs_core::{PresetRole, Registry, Schedule};
+    use crate::gaussian_set::gaussian_rate;
+    use cc4dgs_core::{PresetRole, Registry, Schedule, Stage};
 
     #[test]
     fn every_family_and_method_resolves() {
@@ -113,8 +114,8 @@ mod tests {
             // Where none is stated, rounds end at 10,000, and there are no resets.
             let at = |key: &str| schedule.at(config.density.get(key).map_or(if key == "until" { 10_000 } else { 0 }, |v| v.as_integer().unwrap() as usize));
             assert!(at("reset_main_every").abs_diff(3000) <= 1, "{method}: {}", at("reset_main_every"));
-            // Shares of a main stage are whole numbers of its reference: up to 27 iterations off.
-            assert!(at("until").abs_diff(last) <= 27, "{method}: {}", at("until"));
+            // Rounded to reference iterations, and never so that one more reset is due.
+            assert!((last - 2..=last).contains(&at("until")), "{method}: {}", at("until"));
         }
         let config = RunConfig::resolve(Some("n3dv+hexplane"), None, &[]).unwrap();
         assert_eq!(Schedule::main(14_000).at(config.density["until"].as_integer().unwrap() as usize), 10_000);
@@ -123,7 +124,8 @@ mod tests {
         assert_eq!((config.train.iterations, config.train.shares), (20_000, [3.0, 0.0, 17.0]));
         let schedule = Schedule { total: 20_000, ..Schedule::main(17_000) };
         let reference = |key: &str| config.density[key].as_integer().unwrap() as usize;
-        assert_eq!((schedule.at(reference("until")), schedule.at(reference("reset_main_every"))), (12_000, 6000));
+        // Resets after 6,000 and 12,000 of all.
+        assert_eq!(["until", "reset_main_first", "reset_main_every"].map(|key| schedule.at(reference(key))), [12_000, 3000, 6000]);
         assert_eq!((schedule.interval(reference("every"), 25), reference("reset_every")), (400, 0));
         assert!((config.deformer["smooth_from"].as_float().unwrap() * 17_000.0 - 12_000.0).abs() < 10.0, "when Gaussians no longer grow");
     }
@@ -163,9 +165,28 @@ mod tests {
         let [of_grid4d, of_mlp] = ["grid4d", "deform-mlp"].map(|method| RunConfig::resolve(Some(&format!("dnerf+{method}")), None, &[]).unwrap());
         near(rate(&of_grid4d, "lr_start"), after(8e-4, 1.6e-6, 3.0 / 45.0));
         near(rate(&of_grid4d, "lr_grid_start"), after(8e-3, 8e-5, 3.0 / 45.0));
+        near(rate(&of_grid4d, "lr_end"), after(8e-4, 1.6e-6, 50.0 / 45.0));
+        near(rate(&of_grid4d, "lr_grid_end"), after(8e-3, 8e-5, 50.0 / 45.0));
         near(rate(&of_mlp, "lr_start"), after(8e-4, 1.6e-6, 3.0 / 40.0));
         near(grid4d.train.lr.means_end, after(1.6e-4, 1.6e-6, 20.0 / 35.0));
         near(after(grid4d.train.lr.means, grid4d.train.lr.means_end, grid4d.train.lr.coarse_decay), after(1.6e-4, 1.6e-6, 3.0 / 35.0));
+    }
+
+    #[test]
+    fn rates_of_centres_go_on_where_the_published_schedule_is_one() {
+        for (method, coarse, falls) in [("deform-mlp", 3000, 30_000.0), ("grid4d", 3000, 35_000.0), ("native-4d", 0, 30_000.0)] {
+            let config = RunConfig::resolve(Some(&format!("dnerf+{method}")), None, &[]).unwrap();
+            let length = config.train.iterations - coarse;
+            let published = |iteration: usize| 1.6e-4 * 0.01f64.powf((iteration as f64 / falls).min(1.0));
+            let rate = |stage: Stage, length: usize, iteration: usize| {
+                gaussian_rate(&config.train.lr, "means", &Schedule { stage, iteration, ..Schedule::main(length) })
+            };
+            let of_main = [1, 10_000, length].map(|iteration| (rate(Stage::Main, length, iteration), published(coarse + iteration)));
+            let of_coarse = (coarse > 0).then(|| (rate(Stage::Coarse, coarse, coarse), published(coarse)));
+            for (found, wanted) in of_main.into_iter().chain(of_coarse) {
+                assert!((found / wanted - 1.0).abs() < 5e-3, "{method}: {found} is not {wanted}");
+            }
+        }
     }
 
     #[test]
@@ -178,6 +199,8 @@ mod tests {
             assert!((duration / (seconds / 5.0).sqrt() - 1.0).abs() < 1e-3 && (rate / 1.6e-4 - 1.0).abs() < 1e-9, "{family}: {duration} s, {rate}");
             assert_eq!(config.render.background, Some([0.0; 3]), "{family}");
             assert_eq!(config.density["max_scale_share"].as_float(), Some(0.1), "{family}");
+            assert_eq!(config.density["max_scale_from"].as_integer(), Some(2001), "{family}: after 3,000 of 30,000");
+            assert!((of("harmonics_every", 0.0) * 30_000.0 - 1000.0).abs() < 10.0, "{family}: a degree of colours after every 1,000");
         }
     }
 }

@@ -58,7 +58,8 @@ pub struct TrainConfig {
     pub image_growth: f64,
     /// Standard deviation, in frames, of noise on the times the field is asked about; it falls to zero by half of the main stage (Deformable 3DGS: 0.1).
     pub time_noise: f64,
-    /// Share of the Gaussians that a view is drawn without at the end of the coarse and the main stage, from 0 at their start (DropGaussian, Park et al. 2025: 0.2).
+    /// Share of the Gaussians that a view is drawn without at the end of the coarse and the main stage, from 0 at their start (DropGaussian, Park et al. 2025:
+    /// 0.2).
     pub dropout: f64,
     /// Highest spherical-harmonics degree.
     pub sh_degree: usize,
@@ -81,8 +82,8 @@ pub struct TrainConfig {
     pub mask_threshold: f32,
     /// Standard deviation in pixels of the Gaussian by which temporal deviations are blurred. Published masks have 5, for images 1,352 pixels wide.
     pub mask_sigma: f32,
-    /// At a third and at two thirds of the main stage, but not before `time_ramp`, scored Gaussians that move by less than so many pixels in every training camera are
-    /// made static; 0 is off.
+    /// At a third and at two thirds of the main stage, but not before `time_ramp`, scored Gaussians that move by less than so many pixels in every training
+    /// camera are made static; 0 is off.
     pub settle: f32,
     /// Where several cameras see each frame: every so many frames is a key frame, at which what moves starts with points and lives of its own; 0 is off.
     pub key_frames: usize,
@@ -158,8 +159,13 @@ pub struct GaussianRates {
     pub means: f64,
     /// Positions at the last iteration of a stage, times the same extent.
     pub means_end: f64,
-    /// Share of the way from the first rate of positions to the last one that the coarse stage goes: 1 is all of it, 0.25 that of the published 5,000 of 20,000 iterations.
+    /// Share of the way from the first rate of positions to the last one that the coarse stage goes: 1 is all of it, 0.25 that of the published 5,000 of 20,000
+    /// iterations.
     pub coarse_decay: f64,
+    /// Share of that way at which the main stage begins: 0 is anew, as many as `coarse_decay` goes on from where the coarse stage ends.
+    pub main_decay: f64,
+    /// Share of the main stage after which positions have their last rate.
+    pub main_until: f64,
     /// Log-scales.
     pub log_scales: f64,
     /// Quaternions.
@@ -184,6 +190,8 @@ impl Default for GaussianRates {
             means: 1.6e-4,
             means_end: 1.6e-6,
             coarse_decay: 1.0,
+            main_decay: 0.0,
+            main_until: 1.0,
             log_scales: 5e-3,
             quaternions: 1e-3,
             opacity: 0.05,
@@ -198,7 +206,7 @@ impl Default for GaussianRates {
 impl GaussianRates {
     /// The rates with their keys.
     fn rates(&self) -> [(&'static str, f64); 9] {
-        let Self { means, means_end, log_scales, quaternions, opacity, sh_dc, sh_rest, score, extra, coarse_decay: _, batch_power: _, cooldown: _ } = *self;
+        let Self { means, means_end, log_scales, quaternions, opacity, sh_dc, sh_rest, score, extra, .. } = *self;
         [
             ("means", means),
             ("means_end", means_end),
@@ -276,8 +284,13 @@ impl TrainConfig {
         if !(0.0..=1.0).contains(&t.lr.cooldown) {
             return bad("lr.cooldown", format!("{} is not in 0..1", t.lr.cooldown), "It is a share of the main stage; 0.1 is usual");
         }
-        if !(0.0..=1.0).contains(&t.lr.coarse_decay) {
-            return bad("lr.coarse_decay", format!("{} is not in 0..1", t.lr.coarse_decay), "It is a share of the way from lr.means to lr.means_end");
+        for (key, share) in [("lr.coarse_decay", t.lr.coarse_decay), ("lr.main_decay", t.lr.main_decay)] {
+            if !(0.0..=1.0).contains(&share) {
+                return bad(key, format!("{share} is not in 0..1"), "It is a share of the way from lr.means to lr.means_end");
+            }
+        }
+        if !(0.01..=1.0).contains(&t.lr.main_until) {
+            return bad("lr.main_until", format!("{} is not in 0.01..1", t.lr.main_until), "It is a share of the main stage; 1 is all of it");
         }
         if !(0.0..=1.0).contains(&t.image_growth) {
             return bad("image_growth", format!("{} is not in 0..1", t.image_growth), "It is a share of the coarse and main stage");

@@ -21,10 +21,12 @@ corrected = false        # a clone and its original together draw what the origi
 dense_share = 0.01       # largest size that is cloned instead of split, as a share of the extent of the cameras in the normalised frame
 min_opacity = 0.005      # fainter Gaussians are removed
 max_scale_share = 0.0    # larger Gaussians are removed, as a share of the extent; 0 is off
+max_scale_from = 0       # first reference iteration of the main stage at which they are; 0: in all of it and in the coarse stage
 min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
 weight_every = 3000      # reference iterations between two weight prunings; 0 is off
 reset_every = 3000       # reference iterations between two opacity resets of the coarse stage, to 0.01 or twice min_opacity; 0 is off
 reset_main_every = 0     # the same in the main stage, until the last round, in reference iterations of that stage; 0 is off
+reset_main_first = 0     # the first of these, in the same iterations; 0: after the interval
 max_gaussians = 400000   # at this count or more, no Gaussians are added
 ";
 
@@ -53,10 +55,12 @@ struct Settings {
     dense_share: f32,
     min_opacity: f32,
     max_scale_share: f32,
+    max_scale_from: usize,
     min_weight: f32,
     weight_every: usize,
     reset_every: usize,
     reset_main_every: usize,
+    reset_main_first: usize,
     max_gaussians: usize,
 }
 
@@ -72,10 +76,12 @@ impl Default for Settings {
             dense_share: 0.01,
             min_opacity: 0.005,
             max_scale_share: 0.0,
+            max_scale_from: 0,
             min_weight: 0.02,
             weight_every: 3000,
             reset_every: 3000,
             reset_main_every: 0,
+            reset_main_first: 0,
             max_gaussians: 400_000,
         }
     }
@@ -97,14 +103,18 @@ impl Settings {
     /// The actions due after this iteration.
     fn due(&self, schedule: &Schedule) -> Due {
         let (iteration, end) = (schedule.iteration, self.end(schedule));
-        let (reset_every, resets) = match schedule.stage {
-            Stage::Coarse => (self.reset_every, true),
-            _ => (self.reset_main_every, iteration < end),
+        let (every, first, until) = match schedule.stage {
+            Stage::Coarse => (self.reset_every, 0, usize::MAX),
+            _ => (self.reset_main_every, self.reset_main_first, end),
         };
+        let first = schedule.at(if first == 0 { every } else { first });
+        let resets = every > 0 && (first..until).contains(&iteration) && (iteration - first).is_multiple_of(schedule.at(every).max(1));
         Due {
             grow: iteration > schedule.at(self.from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
             prune_weight: self.weight_every > 0 && iteration < end && iteration.is_multiple_of(self.weight_interval(schedule)),
-            reset: resets && reset_every > 0 && iteration.is_multiple_of(schedule.at(reset_every).max(1)) && schedule.left() >= MIN_RECOVERY,
+            reset: resets && schedule.left() >= MIN_RECOVERY,
+            prune_large: self.max_scale_share > 0.0
+                && (self.max_scale_from == 0 || (schedule.stage == Stage::Main && iteration >= schedule.at(self.max_scale_from))),
             held: 0,
         }
     }
@@ -249,7 +259,20 @@ mod tests {
         let both = "reset_every = 1000\nreset_main_every = 2000\nuntil = 10000";
         assert_eq!(resets(both, Stage::Coarse, 5000), [1000, 2000, 3000, 4000]);
         assert_eq!(resets(both, Stage::Main, 30_000), [3000, 6000, 9000, 12_000]);
+        assert_eq!(resets(&format!("{both}\nreset_main_first = 500"), Stage::Main, 30_000), [750, 3750, 6750, 9750, 12_750]);
         assert!(resets("reset_every = 0\nreset_main_every = 0", Stage::Coarse, 5000).is_empty());
+    }
+
+    #[test]
+    fn large_gaussians_are_removed_from_the_iteration_on_that_is_set() {
+        let due = |text: &str, stage: Stage, iteration: usize| {
+            let settings: Settings = toml::from_str(text).unwrap();
+            settings.due(&Schedule { stage, iteration, total: 40_000, ..Schedule::main(30_000) }).prune_large
+        };
+        assert!(!due("", Stage::Main, 5000));
+        assert!(due("max_scale_share = 0.1", Stage::Coarse, 600) && due("max_scale_share = 0.1", Stage::Main, 600));
+        let later = "max_scale_share = 0.1\nmax_scale_from = 2000";
+        assert!(!due(later, Stage::Coarse, 5000) && !due(later, Stage::Main, 2999) && due(later, Stage::Main, 3000));
     }
 
     #[test]

@@ -4,11 +4,16 @@ use super::Settings;
 use crate::density::halves::rotation;
 use crate::density::statistics::Statistics;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DensityPlan, HostGaussians, Result, Seed};
+use cc4dgs_core::{DensityPlan, HostGaussians, Result, SPACE_TIME_ATTRIBUTES, Seed};
 use rand::Rng;
 
 /// The two halves of a split are smaller by this factor (3DGS: 0.8 times 2).
 const SPLIT_SHRINK: f32 = 1.6;
+/// Farthest time from that of its parent at which the half of a split is, in sequences. What lasts longer is there at all times, and a path that is written down
+/// from far away loses digits.
+const FARTHEST: f32 = 10.0;
+/// Largest logarithm of a duration whose exponential is used.
+const MOST_LOG_DURATION: f32 = 30.0;
 
 /// The actions due after an iteration.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -19,12 +24,14 @@ pub(super) struct Due {
     pub prune_weight: bool,
     /// Lower all opacities.
     pub reset: bool,
+    /// Remove large Gaussians.
+    pub prune_large: bool,
     /// How many of `max_gaussians` growth must leave unused.
     pub held: usize,
 }
 
-/// A Gaussian to add: its parent, and a standard normal sample if it comes from a split.
-type Child = (usize, Option<[f32; 3]>);
+/// A Gaussian to add: its parent, and standard normal samples of space and time if it comes from a split.
+type Child = (usize, Option<([f32; 3], f32)>);
 
 /// The plan of one round. `None` if every Gaussian would be removed; then all are kept.
 pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGaussians, due: Due, extent: f32, seed: Seed) -> Result<Option<DensityPlan>> {
@@ -34,9 +41,7 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
     let largest = |i: usize| host.log_scales[3 * i..3 * i + 3].iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)).exp();
     let opacity = |i: usize| 1.0 / (1.0 + (-host.opacity_logits[i]).exp());
     let weak = |i: usize| due.prune_weight && weight[i] < settings.min_weight;
-    let dead = |i: usize| {
-        !host.is_finite(i) || opacity(i) < settings.min_opacity || (settings.max_scale_share > 0.0 && largest(i) > settings.max_scale_share * extent)
-    };
+    let dead = |i: usize| !host.is_finite(i) || opacity(i) < settings.min_opacity || (due.prune_large && largest(i) > settings.max_scale_share * extent);
 
     let correct = |plan: &mut DensityPlan, row: usize, of: usize| {
         // A reset sets all opacities, and the trainer may leave it out.
@@ -45,6 +50,7 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
         }
     };
 
+    let in_time = SpaceTime::of(host);
     let mut plan = DensityPlan::new();
     let mut children: Vec<Child> = Vec::new();
     let capacity = settings.max_gaussians.saturating_sub(n + due.held);
@@ -68,7 +74,8 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
         } else {
             let mut rng = seed.index(i as u64).rng();
             for _ in 0..2 {
-                children.push((i, Some(std::array::from_fn(|_| standard_normal(&mut rng)))));
+                let space = std::array::from_fn(|_| standard_normal(&mut rng));
+                children.push((i, Some((space, if in_time.is_some() { standard_normal(&mut rng) } else { 0.0 }))));
             }
             plan.report.split += 1;
         }
@@ -78,18 +85,50 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
     }
     for &(parent, normal) in &children {
         let row = plan.copy(parent);
-        let Some(normal) = normal else {
+        let Some((normal, normal_in_time)) = normal else {
             correct(&mut plan, row, parent);
             continue;
         };
         let (means, log_scales) = (&host.means[3 * parent..3 * parent + 3], &host.log_scales[3 * parent..3 * parent + 3]);
         let sample = glam::Vec3::from_array(std::array::from_fn(|a| normal[a] * log_scales[a].exp()));
-        let mean = glam::Vec3::from_slice(means) + rotation(&host.quaternions[4 * parent..4 * parent + 4]) * sample;
-        plan.set(row, "means", &mean.to_array());
         let shrink = SPLIT_SHRINK.ln();
+        let mut moved = rotation(&host.quaternions[4 * parent..4 * parent + 4]) * sample;
+        if let Some(times) = &in_time {
+            moved += times.split(&mut plan, row, parent, normal_in_time, shrink);
+        }
+        let mean = glam::Vec3::from_slice(means);
+        // An enormous Gaussian may have no such point in float32.
+        plan.set(row, "means", &if (mean + moved).is_finite() { mean + moved } else { mean }.to_array());
         plan.set(row, "log_scales", &[log_scales[0] - shrink, log_scales[1] - shrink, log_scales[2] - shrink]);
     }
     Ok(Some(plan))
+}
+
+/// What places the Gaussians in time, where they carry [`SPACE_TIME_ATTRIBUTES`].
+struct SpaceTime<'a> {
+    centers: &'a [f32],
+    log_durations: &'a [f32],
+    velocities: &'a [f32],
+}
+
+impl<'a> SpaceTime<'a> {
+    fn of(host: &'a HostGaussians) -> Option<Self> {
+        let [centers, log_durations, velocities] = SPACE_TIME_ATTRIBUTES.map(|(name, width)| {
+            let attribute = host.extra.get(name)?;
+            (attribute.width == width && attribute.values.len() == width * host.len()).then_some(&attribute.values[..])
+        });
+        Some(Self { centers: centers?, log_durations: log_durations?, velocities: velocities? })
+    }
+    /// Moves the new row `row`, one of the two that replace `parent`, to a random time of its parent, and shortens it. Returns how far its centre lies from
+    /// that of its parent then. Together with a random point of the conditional Gaussian this is a random point of the Gaussian over space and time, as in
+    /// 4D-GS.
+    fn split(&self, plan: &mut DensityPlan, row: usize, parent: usize, normal: f32, shrink: f32) -> glam::Vec3 {
+        let [(center, _), (log_duration, _), _] = SPACE_TIME_ATTRIBUTES;
+        let since = (normal * self.log_durations[parent].min(MOST_LOG_DURATION).exp()).clamp(-FARTHEST, FARTHEST);
+        plan.set(row, center, &[self.centers[parent] + since]);
+        plan.set(row, log_duration, &[self.log_durations[parent] - shrink]);
+        since * glam::Vec3::from_slice(&self.velocities[3 * parent..3 * parent + 3])
+    }
 }
 
 /// The logit of the opacity p of each of two equal Gaussians that together have `opacity`: 1 - (1 - p)^2 (Rota Bulo et al. 2024, "Revising densification").
@@ -144,6 +183,47 @@ mod tests {
         assert_eq!(after.extra["label"].values, vec![0.0, 3.0, 0.0, 1.0, 1.0]);
         assert!((after.log_scales[9] + SPLIT_SHRINK.ln()).abs() < 1e-6);
         assert_ne!(after.means[9..12], after.means[12..15], "the two halves are different samples");
+    }
+
+    #[test]
+    fn gaussians_of_space_and_time_are_split_in_both() {
+        let device = Device::flex();
+        let mut host = host_of(2);
+        // Of size 1e-4, so that halves lie on the path of their parent. The second is small, and is cloned.
+        host.log_scales = [[1e-4f32.ln(); 3], [1e-9f32.ln(); 3]].concat();
+        let of = |width, row: &[f32]| ExtraAttribute::exact(width, row.repeat(2));
+        host.extra.extend(
+            [("time_center", of(1, &[0.5])), ("log_duration", of(1, &[0.2f32.ln()])), ("velocity", of(3, &[2.0, 0.0, -1.0]))].map(|(n, v)| (n.into(), v)),
+        );
+        let mut statistics = Statistics::zeros(2, &device);
+        statistics.gradients = Tensor::from_floats([[1.0, 1.0], [1.0, 1.0]], &device);
+        let settings = Settings { dense_share: 1e-6, ..Settings::default() };
+        let due = Due { grow: true, ..Default::default() };
+        let gaussians = Gaussians::from_host(&host, &device);
+        let plan = round(&settings, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
+        plan.check("clone-split", &gaussians).unwrap();
+        let after = plan.apply(&gaussians).unwrap().to_host().unwrap();
+        assert_eq!(plan.parents(), [1, 0, 0, 1]);
+        let (times, durations) = (&after.extra["time_center"].values, &after.extra["log_duration"].values);
+        assert!(times[1] != times[2] && times[1] != 0.5 && times[0] == 0.5 && times[3] == 0.5, "{times:?}");
+        for row in [1, 2] {
+            let since = times[row] - 0.5;
+            let moved = [2.0 * since, 0.0, -since];
+            let centre = &after.means[3 * row..3 * row + 3];
+            assert!(centre.iter().zip(moved).all(|(a, b)| (a - b).abs() < 1e-3), "{centre:?} is not at {moved:?}");
+            assert!((durations[row] - (0.2f32 / SPLIT_SHRINK).ln()).abs() < 1e-6 && since.abs() < 1.0, "{durations:?}");
+        }
+        assert!(durations[0] == durations[3] && (durations[0] - 0.2f32.ln()).abs() < 1e-6, "a clone keeps its duration");
+        // What is there at all times stays near.
+        host.extra.insert("log_duration".into(), of(1, &[120.0]));
+        let plan = round(&settings, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
+        plan.check("clone-split", &gaussians).unwrap();
+        let after = plan.apply(&gaussians).unwrap().to_host().unwrap();
+        assert!(after.extra["time_center"].values.iter().all(|t| t.abs() <= 10.5) && after.means.iter().all(|x| x.abs() <= 21.0), "{:?}", after.means);
+        // Neither enormous paths nor enormous sizes make a plan that is refused.
+        host.extra.insert("velocity".into(), of(3, &[f32::MAX, 0.0, 0.0]));
+        host.log_scales.fill(200.0);
+        round(&settings, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap().check("clone-split", &gaussians).unwrap();
     }
 
     #[test]
