@@ -1,4 +1,5 @@
-//! Trainings with pose models: values that are not finite, checkpoints without poses, wgpu, and cameras that are one, that move, or that share a point.
+//! Trainings with pose models: values that are not finite, checkpoints without poses, wgpu, key frames, and cameras that are one, that move, or that share a
+//! point.
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs::{RunConfig, deformers as _, parts as _};
@@ -89,8 +90,8 @@ impl Trained {
     }
 }
 
-/// Shifts every camera along its own axes, less the mean. Where a weight is over `limit`, no pose is finite. The default never is, because the conformance suite
-/// runs for every registered model.
+/// Shifts every camera along its own axes, less the mean. Where a weight is over `limit`, no pose is finite; with `gather` all cameras stand at the origin.
+/// With the defaults neither happens, because the conformance suite runs for every registered model.
 struct Stumbling {
     settings: Settings,
     shifts: Parameter,
@@ -100,11 +101,12 @@ struct Stumbling {
 #[serde(deny_unknown_fields, default)]
 struct Settings {
     limit: f32,
+    gather: bool,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { limit: 1e9 }
+        Self { limit: 1e9, gather: false }
     }
 }
 
@@ -120,6 +122,9 @@ impl Poses for Stumbling {
         let mut moved = camera.clone();
         for (row, shift) in moved.world_to_camera.iter_mut().zip(to_vec(own.clone(), "shift")?) {
             row[3] += if largest > self.settings.limit { f64::NAN } else { f64::from(shift) };
+            if self.settings.gather {
+                row[3] = 0.0;
+            }
         }
         let column = own.reshape([3, 1]);
         let device = column.device();
@@ -145,7 +150,14 @@ fn build(section: &toml::Table, context: &PosesContext, device: &Device) -> Resu
 
 inventory::submit! {
     PosesPlugin {
-        info: Plugin { name: "stumbling", version: "1", summary: "poses that break", paper: "a test", schema: "limit = 1e9\n", capabilities: &[] },
+        info: Plugin {
+            name: "stumbling",
+            version: "1",
+            summary: "poses that break",
+            paper: "a test",
+            schema: "limit = 1e9\ngather = false\n",
+            capabilities: &[],
+        },
         build,
     }
 }
@@ -316,4 +328,21 @@ fn cameras_that_share_a_point_are_refined() {
     assert_eq!(scene.extent(), 1.0, "their distances from the mean are no unit of length");
     let count = cameras(&scene);
     trained(&config, scene).assert_refined(count);
+}
+
+#[test]
+fn key_frames_are_matched_with_corrected_cameras() {
+    let of = |poses: &str| {
+        let small = ["scene.width=96", "scene.height=96", "init.count=200", "train.shares=[0.0, 1.0, 1.0]", "train.iterations=12", "train.checks=false"];
+        let parts = ["density={kind='none'}", "train.key_frames=4", "train.dynamic=score", poses];
+        let sets: Vec<String> = small.iter().chain(&parts).map(ToString::to_string).collect();
+        let mut config = RunConfig::resolve(Some("demo+free-time"), None, &sets).unwrap();
+        config.device = "flex".into();
+        trained(&config, open("procedural", &config))
+    };
+    let (recorded, gathered) = (of("poses.kind=none"), of("poses={kind='stumbling', gather=true}"));
+    assert!(recorded.said("train.key_frames").is_empty() && recorded.said("key frames").len() == 1, "{:?}", recorded.events);
+    // Images from one point say nothing of depth.
+    let said = gathered.said("train.key_frames");
+    assert!(said.len() == 1 && said[0].contains("points need several cameras") && gathered.said("key frames").is_empty(), "{:?}", gathered.events);
 }

@@ -24,7 +24,8 @@ const WIDTH_SHARE: f64 = 0.01;
 const OPACITY: f32 = 0.6;
 
 impl Context<'_> {
-    /// Adds the Gaussians of key frames at the start of the main stage, where `train.key_frames` asks for them, and gives what moved at the first frame a life there.
+    /// Adds the Gaussians of key frames at the start of the main stage, where `train.key_frames` asks for them, and gives what moved at the first frame a life
+    /// there.
     pub(super) fn add_key_frames(&self, state: &mut TrainState) -> Result<()> {
         let (every, frames) = (self.job.config.train.key_frames, self.job.scene.frame_count);
         if every == 0 || frames <= 1 {
@@ -46,7 +47,8 @@ impl Context<'_> {
             return Ok(());
         }
         let seed = self.seed.child("key frames");
-        let scene = &self.job.scene;
+        // Points have to lie where the cameras that are trained with see them.
+        let scene = &self.posed_scene(&self.job.scene, state)?;
         let mask_of = |camera: usize| self.masks.iter().find(|mask| scene.views[mask.view].camera == camera);
         let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
         let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));

@@ -1,5 +1,5 @@
-//! Things that the model does not draw at all: a ball that crosses the scene is nowhere long enough for a static reconstruction, and once it is missing, no gradient
-//! brings it back.
+//! Things that the model does not draw at all: a ball that crosses the scene is nowhere long enough for a static reconstruction, and once it is missing, no
+//! gradient brings it back.
 //!
 //! During the main stage, training views are rendered and compared. Compact regions that differ much are looked for in views of neighbouring times; where
 //! enough of them agree on a straight track, Gaussians are added along it, each with a velocity and a life of its own ([`cc4dgs_core::LIFE_ATTRIBUTES`]).
@@ -34,8 +34,8 @@ const IMAGES: usize = 8;
 const LEAST_FRAMES: usize = 3;
 /// The most things at a time.
 const TRACKS: usize = 3;
-/// Share of the regions that tracks must explain before Gaussians are given lives, which cost time: else the regions are what the deformer has not learned yet, and
-/// some agree by chance.
+/// Share of the regions that tracks must explain before Gaussians are given lives, which cost time: else the regions are what the deformer has not learned yet,
+/// and some agree by chance.
 const LEAST_EXPLAINED: f64 = 0.35;
 
 /// What a view shows and the model does not. Images are not kept: they are loaded once more for the colours of what is added.

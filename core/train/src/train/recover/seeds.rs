@@ -16,8 +16,8 @@ pub(super) const PER_TRACK: usize = 64;
 /// Where their centres lie, as a share of the radius, and their standard deviation as a share of their distance.
 const DEPTH: f64 = 0.85;
 const SIZE: f64 = 0.5;
-/// Largest standard deviation, as a share of the width of the image, in the nearest camera: that of the largest regions that are looked for. The images that show
-/// the thing hold to it anyway, but another camera may be much nearer to it.
+/// Largest standard deviation, as a share of the width of the image, in the nearest camera: that of the largest regions that are looked for. The images that
+/// show the thing hold to it anyway, but another camera may be much nearer to it.
 const WIDTH_SHARE: f64 = 0.025;
 /// Their opacity as a logit: 0.8.
 const OPACITY_LOGIT: f32 = 1.386;
@@ -38,7 +38,8 @@ pub(super) fn plan(context: &Context, state: &TrainState, lost: &[Lost], sightin
     let coefficients = state.set.get("sh_rest")?.dims()[1];
     let parents = Parents::new(&state.set.host_gaussians()?, state.moving);
     let points: Vec<(&Track, DVec3)> = tracks.iter().flat_map(|track| normals().map(move |normal| (track, normal))).collect();
-    let (host, capped) = gaussians(scene, &points);
+    let posed = context.posed_scene(&context.job.scene, state)?;
+    let (host, capped) = gaussians(&posed, &points);
     let pixels: Vec<Option<Pixel>> = points.iter().map(|&(track, normal)| pixel_of(lost, sightings, track, normal)).collect();
     let colours = colours_of(scene, &pixels, context.job.config.background()?)?;
     let mut plan = DensityPlan::unchanged(state.set.len());
@@ -96,8 +97,8 @@ struct Pixel {
     index: usize,
 }
 
-/// The pixel that shows the point of a track's sphere with this outward `normal`, in the image that sees it most from the front; `None` where that is behind the
-/// camera.
+/// The pixel that shows the point of a track's sphere with this outward `normal`, in the image that sees it most from the front; `None` where that is behind
+/// the camera.
 fn pixel_of(lost: &[Lost], sightings: &[Sighting], track: &Track, normal: DVec3) -> Option<Pixel> {
     let front = |&i: &usize| -sightings[i].direction.dot(normal);
     let best = track.sightings.iter().copied().max_by(|a, b| front(a).total_cmp(&front(b)))?;

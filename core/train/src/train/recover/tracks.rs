@@ -1,7 +1,7 @@
 //! Straight tracks through sightings from several cameras at several times: where a compact thing was, and how fast.
 //!
-//! A sighting says that the thing is somewhere on a ray at a time. For a point p with velocity v, the distance to each ray is linear in (p, v), so that three rays
-//! from different positions give a track, and more of them give the one of least squares.
+//! A sighting says that the thing is somewhere on a ray at a time. For a point p with velocity v, the distance to each ray is linear in (p, v), so that three
+//! rays from different positions give a track, and more of them give the one of least squares.
 
 use cc4dgs_core::Seed;
 use glam::{DMat3, DVec3};
@@ -102,8 +102,8 @@ fn fit(sightings: &[Sighting], chosen: Vec<usize>, time: f64) -> Option<Track> {
     (track.radius.is_finite() && track.radius > 0.0).then_some(track)
 }
 
-/// The normal equations of the track of least squares through the rays of `chosen`, for position and velocity, with the right side in the last column. `clock` is
-/// the time of a sighting that the velocity refers to.
+/// The normal equations of the track of least squares through the rays of `chosen`, for position and velocity, with the right side in the last column. `clock`
+/// is the time of a sighting that the velocity refers to.
 fn normal_equations(sightings: &[Sighting], chosen: &[usize], clock: impl Fn(&Sighting) -> f64) -> [[f64; 7]; 6] {
     let mut system = [[0.0f64; 7]; 6];
     for &i in chosen {
@@ -156,8 +156,8 @@ fn depth(sighting: &Sighting, track: &Track) -> f64 {
 /// How well the rays of `chosen` fix a track: the angle in radians between the rays of two standing cameras that see it at all times and fix it as well.
 ///
 /// A change of position and velocity shifts the thing at each time. Of all changes, take the one that the rays show least: its part across the rays is a share
-/// of the whole (root mean squares), and the angle is twice the arc sine of that share. The angle between the rays themselves says nothing where camera and thing
-/// both move: a camera that goes along a line at constant speed sees the same rays of things at any distance, each on a straight track of its own.
+/// of the whole (root mean squares), and the angle is twice the arc sine of that share. The angle between the rays themselves says nothing where camera and
+/// thing both move: a camera that goes along a line at constant speed sees the same rays of things at any distance, each on a straight track of its own.
 fn parallax(sightings: &[Sighting], chosen: &[usize]) -> f64 {
     let n = chosen.len().max(1) as f64;
     let mean = chosen.iter().map(|&i| sightings[i].time).sum::<f64>() / n;
