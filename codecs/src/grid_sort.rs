@@ -1,8 +1,8 @@
 //! Sorts Gaussians into a square grid so that neighbours are similar (self-organising Gaussian grids, Morgenstern et al. 2024). An image of one of their
 //! components is then smooth and compresses well.
 //!
-//! The initial order follows a space-filling curve. Then pairs of cells swap their Gaussians if that brings both closer to the blurred features around them. The
-//! radius of the blur shrinks from round to round.
+//! The initial order follows a space-filling curve. Then pairs of cells swap their Gaussians if that brings both closer to the blurred features around them.
+//! The radius of the blur shrinks from round to round.
 
 use cc4dgs_format::{HostGaussians, Seed};
 

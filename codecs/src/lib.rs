@@ -36,8 +36,8 @@ impl From<NoEncoders> for Error {
     }
 }
 
-/// Refuses where the crate was built without the feature `encoders`. The compiler then leaves out what follows. It must see that `Ok` is impossible: of an [`Error`],
-/// which is built by a call, it does not, and encoders stay in the program.
+/// Refuses where the crate was built without the feature `encoders`. The compiler then leaves out what follows. It must see that `Ok` is impossible: of an
+/// [`Error`], which is built by a call, it does not, and encoders stay in the program.
 #[inline(always)]
 pub(crate) fn require_encoders() -> Result<(), NoEncoders> {
     if cfg!(feature = "encoders") { Ok(()) } else { Err(NoEncoders) }

@@ -15,7 +15,8 @@ use serde::Deserialize;
 const VERSION: u8 = 2;
 /// Share of the values at either end that may be stored exactly, as outliers.
 const TAIL: f64 = 1e-3;
-/// Upper bound on the step, in standard deviations times 2^-bits; a wider step takes more bits. Percentiles of long-tailed values lie some ten deviations apart.
+/// Upper bound on the step, in standard deviations times 2^-bits; a wider step takes more bits. Percentiles of long-tailed values lie some ten deviations
+/// apart.
 const SPREAD: f64 = 8.0;
 
 pub(crate) const SCHEMA: &str = "\

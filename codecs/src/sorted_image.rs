@@ -25,8 +25,8 @@ struct SortedImage {
     bits: Bits,
 }
 
-/// Codes as byte planes, the low bytes of all codes before the high ones. The high bytes of 16-bit codes form a smooth plane and the low bytes a noisy one; mixed,
-/// both would look like noise to an image coder.
+/// Codes as byte planes, the low bytes of all codes before the high ones. The high bytes of 16-bit codes form a smooth plane and the low bytes a noisy one;
+/// mixed, both would look like noise to an image coder.
 fn planes(columns: &[Column], count: usize) -> Vec<u8> {
     let mut out = Vec::new();
     for column in columns {

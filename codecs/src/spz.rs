@@ -84,7 +84,8 @@ impl AttributeCodec for Spz {
         Ok(out)
     }
     fn losses(&self) -> Vec<DeclaredLoss> {
-        // Harmonics: half a step over a standard deviation of some hundredths. Quaternions of static models lose length and sign, which do not change rotations.
+        // Harmonics: half a step over a standard deviation of some hundredths. Quaternions of static models lose length and sign, which do not change
+        // rotations.
         let harmonics = 16.0 * f64::from(1u32 << (8 - self.sh_rest_bits.min(self.sh1_bits))) / 256.0;
         [("means", 1e-3), ("log_scales", 0.1), ("quaternions", 2.5), ("opacity_logits", 1.0), ("sh_dc", 0.1), ("sh_rest", harmonics)]
             .map(|(attribute, relative_rms)| DeclaredLoss { attribute: attribute.into(), relative_rms })

@@ -119,7 +119,8 @@ impl WeightCodec for Precision {
     fn loss(&self) -> f64 {
         match self {
             Self::Fp32 => 0.0,
-            // The rounding of an 11-bit significand. Values below 2^-14 are rounded to multiples of 2^-24, which is no more beside a largest value from 2^-14 on.
+            // The rounding of an 11-bit significand. Values below 2^-14 are rounded to multiples of 2^-24, which is no more beside a largest value from 2^-14
+            // on.
             Self::Fp16 => 1.0 / 2048.0,
             // Half a step, plus the rounding of the scale.
             Self::Int8 => 0.5 / 127.0 + 1e-5,

@@ -170,8 +170,8 @@ impl Embedding {
         let part = self.progress / s.rows_grow;
         (s.coarse_rows + ((s.time_rows - s.coarse_rows) as f32 * part) as usize).clamp(2, s.time_rows)
     }
-    /// Fade-in factor of a head at the current progress, 0..1. The published code fades in over 1,000 iterations; opacity, colour and scale over 1,000 after the
-    /// first 5,000.
+    /// Fade-in factor of a head at the current progress, 0..1. The published code fades in over 1,000 iterations; opacity, colour and scale over 1,000 after
+    /// the first 5,000.
     fn share_of(&self, head: Head) -> f32 {
         let fade = self.settings.fade_in;
         let begun = match head {
@@ -213,8 +213,8 @@ impl Deformer for Embedding {
         });
         Ok(heads::offsets(&self.settings.heads, faded.collect(), self.sh_degree))
     }
-    /// `smooth_weight` times the mean of sqrt(exp(-smooth_falloff d²) |z_i - z_j|² + 1e-20) over up to 2,048 random pairs of neighbours i and j, with the vectors
-    /// z, at the distance d; see [`neighbour_pairs`]. It reads the centres back, and its time is linear in their number.
+    /// `smooth_weight` times the mean of sqrt(exp(-smooth_falloff d²) |z_i - z_j|² + 1e-20) over up to 2,048 random pairs of neighbours i and j, with the
+    /// vectors z, at the distance d; see [`neighbour_pairs`]. It reads the centres back, and its time is linear in their number.
     fn regularizer(&self, input: &SpatialInput, _time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let Some(vectors) = input.attributes.first().filter(|_| s.smooth_weight > 0.0 && input.len() > 1) else { return Ok(None) };

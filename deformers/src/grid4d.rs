@@ -1,9 +1,9 @@
 //! The deformer of Grid4D: a spatial hash grid whose features, turned into attention, weigh those of three grids over pairs of axes and time (Xu et al. 2024).
 //!
-//! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised
-//! by the deformer's box rather than by a fixed bound per dataset, and so are the perturbations of the smoothness term. R(q) passes no gradient to the canonical
-//! centre. The published term begins when Gaussians no longer grow on N3DV, for which there is `smooth_from`. It also perturbs times on most D-NeRF scenes, which
-//! is omitted. The last layers start at zero, so that nothing moves at first; the published ones are random.
+//! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised by
+//! the deformer's box rather than by a fixed bound per dataset, and so are the perturbations of the smoothness term. R(q) passes no gradient to the canonical
+//! centre. The published term begins when Gaussians no longer grow on N3DV, for which there is `smooth_from`. It also perturbs times on most D-NeRF scenes,
+//! which is omitted. The last layers start at zero, so that nothing moves at first; the published ones are random.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
 use crate::parts::settings::{bounded, not_negative, within};

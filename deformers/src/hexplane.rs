@@ -196,8 +196,8 @@ impl Deformer for HexPlane {
         let group = |name, factor| ParameterGroup { times_extent: s.times_extent, ..ParameterGroup::plain(name, s.lr_start * factor, s.lr_end * factor) };
         vec![group("hexplane net", 1.0), group("hexplane planes", s.grid_rate)]
     }
-    /// Smoothness of all planes, and closeness to 1 of planes with time (weights of the published code): squared second differences along a plane's second axis,
-    /// which is time if the plane has it.
+    /// Smoothness of all planes, and closeness to 1 of planes with time (weights of the published code): squared second differences along a plane's second
+    /// axis, which is time if the plane has it.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let mut total: Option<Tensor<1>> = None;

@@ -28,8 +28,8 @@ velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, tim
 
 /// A deformer whose Gaussians have lives too.
 ///
-/// It does not forward [`Deformer::packed`]. Features are one array, lives first, and `deform` has to tell from it alone how the rest is stored: packed by columns,
-/// it is logically another matrix, and only its strides say so, which views and copies of a part do not keep on every backend.
+/// It does not forward [`Deformer::packed`]. Features are one array, lives first, and `deform` has to tell from it alone how the rest is stored: packed by
+/// columns, it is logically another matrix, and only its strides say so, which views and copies of a part do not keep on every backend.
 struct WithLife {
     inner: Box<dyn Deformer>,
     life: Life,

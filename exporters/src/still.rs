@@ -22,8 +22,8 @@ pub fn check(gaussians: &HostGaussians, format: &str) -> Result<()> {
 /// Logit of an invisible opacity (2e-35); that of opacity 0 is not finite.
 const INVISIBLE: f32 = -80.0;
 
-/// `gaussians` for formats that hold them as they are trained. Rotations of length zero, which are not drawn here, become the identity and invisible: other programs
-/// divide by the length.
+/// `gaussians` for formats that hold them as they are trained. Rotations of length zero, which are not drawn here, become the identity and invisible: other
+/// programs divide by the length.
 pub fn with_rotations(mut gaussians: HostGaussians) -> HostGaussians {
     for (q, logit) in gaussians.quaternions.as_chunks_mut::<4>().0.iter_mut().zip(&mut gaussians.opacity_logits) {
         if unit(q).is_none() {

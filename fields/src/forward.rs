@@ -2,7 +2,8 @@
 
 use crate::networks::{LAYER_NORM_EPSILON, MishShape, ReluShape};
 
-/// The outputs `[rows, output]` of a decoder for `x` `[rows, input]`: hidden layers are linear, LayerNorm, and Mish. `weights` has [`MishShape::parameter_count`] values.
+/// The outputs `[rows, output]` of a decoder for `x` `[rows, input]`: hidden layers are linear, LayerNorm, and Mish. `weights` has
+/// [`MishShape::parameter_count`] values.
 pub fn decode(shape: &MishShape, weights: &[f32], mut x: Vec<f32>) -> Vec<f32> {
     for layer in shape.layers() {
         x = linear(&x, &weights[layer.weight.clone()], &weights[layer.bias.clone()]);

@@ -1,5 +1,5 @@
-//! Interpolated lookups in grids of stored features: dense, or hashed where a level has more vertices than rows (Müller et al. 2022). Shapes, and the evaluation
-//! without burn that kernels and players share.
+//! Interpolated lookups in grids of stored features: dense, or hashed where a level has more vertices than rows (Müller et al. 2022). Shapes, and the
+//! evaluation without burn that kernels and players share.
 
 use rayon::prelude::*;
 

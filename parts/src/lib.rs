@@ -1,5 +1,5 @@
-//! The exchangeable parts of the trainer, one file each: density controls, loss terms, appearance models, pose models and optimizers. No code refers to them; they
-//! are found in the registry by the names that configurations use.
+//! The exchangeable parts of the trainer, one file each: density controls, loss terms, appearance models, pose models and optimizers. No code refers to them;
+//! they are found in the registry by the names that configurations use.
 
 mod appearance;
 mod density;

@@ -1,7 +1,7 @@
 //! Would storing the coefficients of `cdf-basis` per Gaussian be smaller than storing the networks that compute them?
 //!
-//! Coefficients are rounded to steps that are a share of the root-mean-square of them all, and every column is charged its entropy: of its values, or of the differences between
-//! neighbours along the Morton curve, whichever is less. The image is scored with the rounded ones.
+//! Coefficients are rounded to steps that are a share of the root-mean-square of them all, and every column is charged its entropy: of its values, or of the
+//! differences between neighbours along the Morton curve, whichever is less. The image is scored with the rounded ones.
 //!
 //! `cargo run --release --example stored_coefficients -- MODEL SCENE [VIEWS]`
 

@@ -64,7 +64,8 @@ impl Model {
         self.save_with(path, &ArchiveOptions { codec, settings, field_weights, views, tuner: Some(&tuner) })
     }
     /// As [`Model::save_with`], with `count` views all round the model for codecs that make use of them, where its scene is not there: `compact` looks at how
-    /// much each value matters there, and compares renders before and after. The cameras are outside, so this is for objects: not for rooms that are seen from within.
+    /// much each value matters there, and compares renders before and after. The cameras are outside, so this is for objects: not for rooms that are seen from
+    /// within.
     ///
     /// # Errors
     /// As [`Model::save_with`] and [`OrbitViews::around`], and [`Error::Parameter`](crate::Error::Parameter) for settings that need the images of a scene.

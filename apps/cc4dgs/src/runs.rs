@@ -18,8 +18,8 @@ pub enum Existing {
     Overwrite,
 }
 
-/// Refuses a folder with a run unless it may be overwritten, a folder without a checkpoint if a run is to be resumed, one that a training writes into, a file, and a
-/// folder that cannot be written. `remedy` says what to do instead. Nothing is created.
+/// Refuses a folder with a run unless it may be overwritten, a folder without a checkpoint if a run is to be resumed, one that a training writes into, a file,
+/// and a folder that cannot be written. `remedy` says what to do instead. Nothing is created.
 ///
 /// # Errors
 /// [`Error::Parameter`] that names the folder and what is found there; [`Error::Io`] for a folder that cannot be written.

@@ -22,8 +22,8 @@ pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &R
     Ok(data::hold_out(&scene, usize::try_from(count).unwrap_or(0)).unwrap_or(scene))
 }
 
-/// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. Models may come from untrusted sources: their configuration never
-/// chooses programs to run, folders to write or memory to take.
+/// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. Models may come from untrusted sources: their configuration
+/// never chooses programs to run, folders to write or memory to take.
 ///
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and for stored options of another version.

@@ -110,8 +110,8 @@ impl Session {
     /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder, and a running [`Session::plan`] or
     /// [`Model::save_tuned`] to end with nothing. What begins later is not stopped. May be called from any thread.
     ///
-    /// A program that calls it on Ctrl-C also calls `cc4dgs::train::data::answers_interrupts` first: else Ctrl-C ends an ffmpeg that decodes a video, and opening the scene
-    /// fails.
+    /// A program that calls it on Ctrl-C also calls `cc4dgs::train::data::answers_interrupts` first: else Ctrl-C ends an ffmpeg that decodes a video, and
+    /// opening the scene fails.
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
     }
@@ -134,8 +134,8 @@ impl Session {
         }
         Ok(self.adopted(layers.config()?))
     }
-    /// Opens the dataset at `path` and chooses the settings of a training by looking at it (the preset `auto`), with `key=value` overrides, on this session's device
-    /// and limits. `auto.minutes=5` states the time for the training.
+    /// Opens the dataset at `path` and chooses the settings of a training by looking at it (the preset `auto`), with `key=value` overrides, on this session's
+    /// device and limits. `auto.minutes=5` states the time for the training.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after [`Session::stop`]; as [`Session::config`] and [`Session::read_scene`].
@@ -172,8 +172,8 @@ impl Session {
         }
         self.run(config, scene.into(), out, false)
     }
-    /// Goes on with the run in `folder` from its checkpoint; the result is the same as without the interruption. The session must compute on the device that the
-    /// run's `config.toml` names.
+    /// Goes on with the run in `folder` from its checkpoint; the result is the same as without the interruption. The session must compute on the device that
+    /// the run's `config.toml` names.
     ///
     /// # Errors
     /// As [`Session::train`], and for a folder without a run.

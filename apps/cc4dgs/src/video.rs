@@ -71,8 +71,8 @@ fn rate(fps: f64) -> Result<String> {
     Err(Error::parameter("video", format!("{fps} images per second"), format!("Give {} to {}", RATES.start(), RATES.end())))
 }
 
-/// Encoding that players agree on: 4:2:0 colour, which needs even sides, by the matrix of BT.709 whatever the size, and the index in front. Nothing of the day or
-/// the program is written.
+/// Encoding that players agree on: 4:2:0 colour, which needs even sides, by the matrix of BT.709 whatever the size, and the index in front. Nothing of the day
+/// or the program is written.
 const CODEC: [&str; 18] = [
     "-c:v",
     "libx264",

@@ -27,7 +27,8 @@ const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out 
 #[derive(Debug, Parser)]
 #[command(name = "cc4dgs", version, about, after_help = EXIT_CODES, subcommand_precedence_over_arg = true, arg_required_else_help = true)]
 pub struct Cli {
-    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE. An earlier result in FILE is removed before the command begins; any other FILE is refused.
+    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE. An earlier result in FILE is removed before the
+    /// command begins; any other FILE is refused.
     #[arg(long, global = true, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
     /// Print results and errors only.
@@ -36,7 +37,8 @@ pub struct Cli {
     /// Threads to compute with, at most 1024; 0 uses all cores. Plans of the preset auto depend on it, other results do not.
     #[arg(long, global = true, value_name = "N", default_value_t = 0, value_parser = parse_threads)]
     pub threads: usize,
-    /// Raise or lower what readers accept of a file: max_bytes, max_gaussians, max_pixels or max_depth, such as max_gaussians=50000000; may be given several times.
+    /// Raise or lower what readers accept of a file: max_bytes, max_gaussians, max_pixels or max_depth, such as max_gaussians=50000000; may be given several
+    /// times.
     #[arg(long = "limit", global = true, value_name = "NAME=VALUE")]
     pub limits: Vec<String>,
     #[command(subcommand)]
@@ -74,8 +76,8 @@ pub enum Command {
     Plugins(Plugins),
     /// Check this machine: processor, threads, devices, adapters, ffmpeg, the page of the player, the weights of LPIPS, and an image drawn on each device.
     Doctor(Doctor),
-    /// Compare float32 with float64 under conditions that break floating point. Exit code 5 where a result is neither finite nor an error, and where an ordinary
-    /// condition ends with an error.
+    /// Compare float32 with float64 under conditions that break floating point. Exit code 5 where a result is neither finite nor an error, and where an
+    /// ordinary condition ends with an error.
     Stress(Stress),
     /// Run a grid of scenes, methods, settings, codecs and seeds, and make its tables.
     Sweep(Sweep),
@@ -104,7 +106,8 @@ pub struct Train {
     /// The folder of a dataset, whose format is recognised; `procedural` is the built-in scene, `procedural:captures/NAME` a built-in capture.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Settings to start from: a family, such as dnerf, or a family with another deformer, such as auto+hexplane; `cc4dgs plugins` lists both. Without one and without --config, `auto` chooses them by looking at the scene.
+    /// Settings to start from: a family, such as dnerf, or a family with another deformer, such as auto+hexplane; `cc4dgs plugins` lists both. Without one and
+    /// without --config, `auto` chooses them by looking at the scene.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Wall time in minutes that the preset `auto` plans for; by default ten on processors and five on a graphics card.
@@ -155,8 +158,8 @@ pub struct Compress {
     /// The dataset that the model was trained on, for codecs that make use of its views; validation views, else training views, judge what is lost.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
-    /// For codecs that make use of views, N to choose from all round the model, 12 to 512: for an object whose dataset is not there. They see it from outside, so
-    /// not for rooms that are seen from within, nor where surroundings hide what matters.
+    /// For codecs that make use of views, N to choose from all round the model, 12 to 512: for an object whose dataset is not there. They see it from outside,
+    /// so not for rooms that are seen from within, nor where surroundings hide what matters.
     #[arg(long, value_name = "N", conflicts_with = "scene", value_parser = parse_orbit)]
     pub orbit: Option<usize>,
     /// The archive to write.
@@ -219,7 +222,8 @@ pub struct Report {
     /// The folder of a sweep, a folder of results, or one file of them.
     #[arg(value_name = "DIR")]
     pub results: PathBuf,
-    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default, of a file the .html beside it. Only files of earlier reports are replaced.
+    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default, of a file the .html beside it. Only files of earlier reports
+    /// are replaced.
     #[arg(long, value_name = "FILE.html")]
     pub out: Option<PathBuf>,
     /// Heading of the page.

@@ -56,8 +56,8 @@ impl Output {
     pub fn json_beside(&self) -> Option<&Path> {
         self.json_file().filter(|file| !is_descriptor(file) && file.metadata().map_or(true, |found| found.is_file()))
     }
-    /// Refuses a file for the JSON that cannot be written, and one that exists and is no result of this program, and removes an earlier result, so that it is not
-    /// taken for the result of a command that fails. Call it before any work.
+    /// Refuses a file for the JSON that cannot be written, and one that exists and is no result of this program, and removes an earlier result, so that it is
+    /// not taken for the result of a command that fails. Call it before any work.
     pub fn begin(&self) -> Result<()> {
         let Some(file) = self.json_file() else { return Ok(()) };
         refuse_other_content(file, RESULT, is_result)?;

@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p cc4dgs-player --example frames -- MODEL [--size WIDTHxHEIGHT] [--frames N]`.
 //!
-//! It looks from where the window would begin. Of N frames at times from start to end, the milliseconds of each are those from its commands until the device is idle;
-//! frames per second are those of N frames sent without waiting. The first frame counts from the bytes in memory.
+//! It looks from where the window would begin. Of N frames at times from start to end, the milliseconds of each are those from its commands until the device is
+//! idle; frames per second are those of N frames sent without waiting. The first frame counts from the bytes in memory.
 
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 

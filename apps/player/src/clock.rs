@@ -22,7 +22,8 @@ impl Clock {
     pub fn new(frames: usize, seconds: f32) -> Self {
         Self { time: 0.0, playing: false, speed: 1.0, looping: true, seconds: seconds.max(1e-3), frames: frames.max(1) }
     }
-    /// A clock at the start of another sequence, of `frames` frames that last `seconds`: it stands still, at the speed of this one, and loops where this one does.
+    /// A clock at the start of another sequence, of `frames` frames that last `seconds`: it stands still, at the speed of this one, and loops where this one
+    /// does.
     pub fn of_other(&self, frames: usize, seconds: f32) -> Self {
         Self { speed: self.speed, looping: self.looping, ..Self::new(frames, seconds) }
     }

@@ -83,7 +83,8 @@ impl Content {
         Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, remarks, bytes })
     }
     /// Leaves out the highest degrees of the spherical harmonics until the rest take at most `most_words` 32-bit numbers: what one array of a device holds.
-    /// `remarks` say so then: the `array` that is too small for more, such as "a buffer", and what shows all degrees (`remedy`, a sentence without its full stop).
+    /// `remarks` say so then: the `array` that is too small for more, such as "a buffer", and what shows all degrees (`remedy`, a sentence without its full
+    /// stop).
     pub fn fit_harmonics(&mut self, most_words: u64, array: &str, remedy: &str) {
         self.scene.fit_harmonics(most_words);
         let (drawn, stored) = (self.scene.drawn_degree, self.scene.sh_degree);

@@ -12,8 +12,8 @@ use std::time::Instant;
 
 /// Draws images by the deformer and the rasterizer of one model.
 pub trait ExactImages: Send {
-    /// Opens what it needs, then calls [`ExactRequests::each`], which returns when no more images are wanted. An [`ExactWorker`] calls it on its thread when the
-    /// first image is asked for, and after an error or a panic when the next one is.
+    /// Opens what it needs, then calls [`ExactRequests::each`], which returns when no more images are wanted. An [`ExactWorker`] calls it on its thread when
+    /// the first image is asked for, and after an error or a panic when the next one is.
     ///
     /// # Errors
     /// What keeps it from drawing at all.

@@ -1,7 +1,7 @@
 //! A player of dynamic Gaussians that needs neither burn nor the deformers: wgpu and WGSL, one source for desktop and browser.
 //!
-//! [`Content`] is what a file holds, [`Renderer`] draws it, [`Navigator`] and [`Clock`] are where the user looks from and when. In a browser, `web` wraps them for
-//! the page in `web/`.
+//! [`Content`] is what a file holds, [`Renderer`] draws it, [`Navigator`] and [`Clock`] are where the user looks from and when. In a browser, `web` wraps them
+//! for the page in `web/`.
 //!
 //! A frame is projected by compute shaders, which add the motion of the playback layer on the way, sorted by 16 bits of depth, and blended as instanced quads.
 //! Nothing is read back: the numbers of workgroups and of quads stay on the GPU. Static Gaussians cost no motion and invisible ones are not sorted.

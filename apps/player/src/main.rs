@@ -1,4 +1,5 @@
-//! A window for archives with a playback layer or the weights of `cdf-basis` or `hash-basis`, PLY and SPZ files: `cc4dgs view` without burn, and without what needs it.
+//! A window for archives with a playback layer or the weights of `cdf-basis` or `hash-basis`, PLY and SPZ files: `cc4dgs view` without burn, and without what
+//! needs it.
 
 use cc4dgs_format::{Error, Limits, Result};
 use cc4dgs_player::Content;

@@ -42,7 +42,8 @@ pub fn forward(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f32> {
     out
 }
 
-/// The gradient of the table, given that of the features. A task owns some features of one level and visits the points in order, so that no two tasks write the same element.
+/// The gradient of the table, given that of the features. A task owns some features of one level and visits the points in order, so that no two tasks write the
+/// same element.
 pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
     let f = shape.features;
     let width = shape.levels.len() * f;

@@ -5,8 +5,8 @@
 //! fields, blurred horizontally while still in cache; a vertical blur of those and the gradient. The window is symmetric, so the
 //! adjoint of the blur is the blur.
 //!
-//! Where image and target are equal the similarity is 1 and the gradient 0, so only the box of the pixels that differ is swept, with the margin that the windows
-//! cover: on a plain background most of the image is skipped.
+//! Where image and target are equal the similarity is 1 and the gradient 0, so only the box of the pixels that differ is swept, with the margin that the
+//! windows cover: on a plain background most of the image is skipped.
 
 use crate::cpu::scratch::scratch;
 use crate::cpu::simd::{Lanes, dispatch};

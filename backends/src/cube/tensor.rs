@@ -68,7 +68,8 @@ struct Kept {
 
 static KEPT: LazyLock<Mutex<Kept>> = LazyLock::new(Mutex::default);
 
-/// As [`upload`], for what no kernel writes to. The same values are uploaded once: CubeCL submits all launches before an upload, which costs many times a launch.
+/// As [`upload`], for what no kernel writes to. The same values are uploaded once: CubeCL submits all launches before an upload, which costs many times a
+/// launch.
 pub fn constant<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> CubeTensor {
     let bytes = T::as_bytes(values);
     if bytes.len() > LARGEST_KEPT {

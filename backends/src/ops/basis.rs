@@ -70,7 +70,8 @@ pub trait BasisBackward: Token {
 pub trait BasisOps: Backend {
     /// Coefficients `[M, C]` as they are; their gradient is computed once all combinations have theirs.
     fn coefficients(coefficients: FloatTensor<Self>, combinations: Arc<Combinations>) -> FloatTensor<Self>;
-    /// Flat outputs, head after head, each `[M, outputs]`, of coefficients that [`BasisOps::coefficients`] returned and functions `[F]`; differentiable in both.
+    /// Flat outputs, head after head, each `[M, outputs]`, of coefficients that [`BasisOps::coefficients`] returned and functions `[F]`; differentiable in
+    /// both.
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, combinations: Arc<Combinations>, index: usize) -> FloatTensor<Self>;
 }
 

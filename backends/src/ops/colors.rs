@@ -70,7 +70,8 @@ impl<B: ColorBackward + ColorOps, C: CheckpointStrategy> ColorOps for Autodiff<B
     }
 }
 
-/// Planes `[C,H,W]` (red, green and blue first, C > 2) of which the colours are M rgb + b, with the rows of M, then b in `transform` `[12]`. Differentiable in both.
+/// Planes `[C,H,W]` (red, green and blue first, C > 2) of which the colours are M rgb + b, with the rows of M, then b in `transform` `[12]`. Differentiable in
+/// both.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other shapes.

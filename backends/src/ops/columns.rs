@@ -1,5 +1,5 @@
-//! Matrices side by side. burn's concatenation of columns copies piece by piece through its dispatch, and its derivative is one slice per matrix; here both are one
-//! pass over the rows.
+//! Matrices side by side. burn's concatenation of columns copies piece by piece through its dispatch, and its derivative is one slice per matrix; here both are
+//! one pass over the rows.
 
 use super::autodiff::{differentiate, record};
 use crate::cpu::columns as kernel;

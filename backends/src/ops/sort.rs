@@ -25,7 +25,8 @@ impl<B: CpuBackend> SortOps for B {
     }
 }
 
-/// The indices of `keys` `[N]` in ascending order of their lowest `bits` bits (1 to 32), equal ones in their own order. Keys are taken as unsigned 32-bit numbers.
+/// The indices of `keys` `[N]` in ascending order of their lowest `bits` bits (1 to 32), equal ones in their own order. Keys are taken as unsigned 32-bit
+/// numbers.
 pub fn sort_order(keys: Tensor<1, Int>, bits: u32) -> Result<Tensor<1, Int>> {
     if !(1..=32).contains(&bits) {
         return Err(Error::parameter("sort", format!("{bits} bits"), "Choose 1 to 32"));

@@ -2,7 +2,8 @@
 //!
 //! Slices would do the same, but the derivative of each is a tensor of zeros as large as the whole.
 //!
-//! The tensor holds heads one after the other, each `[rows, times x width]`: per row the outputs at one time after those at another. A piece is a head at one time.
+//! The tensor holds heads one after the other, each `[rows, times x width]`: per row the outputs at one time after those at another. A piece is a head at one
+//! time.
 
 use super::autodiff::{differentiate, record};
 use super::shared::{Shared, Token, share};

@@ -44,8 +44,8 @@ fn check(object: &str, radii: &Tensor<1, Int>, found: &[&[usize]], expected: &[&
     Err(Error::parameter(object, problem, "Give one row per Gaussian"))
 }
 
-/// `sums` `[N,2]` of screen gradients and of views, after a view with these `radii` (0 where a Gaussian is not shown): the norm of `gradient` `[N,2]`, each axis times
-/// its `scale`, and 1 are added where a Gaussian is shown and the norm is finite. In place if `sums` has no other owner.
+/// `sums` `[N,2]` of screen gradients and of views, after a view with these `radii` (0 where a Gaussian is not shown): the norm of `gradient` `[N,2]`, each
+/// axis times its `scale`, and 1 are added where a Gaussian is shown and the norm is finite. In place if `sums` has no other owner.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other shapes.
@@ -59,8 +59,8 @@ pub fn add_gradients(sums: Tensor<2>, radii: Tensor<1, Int>, gradient: Tensor<2>
     Ok(Tensor::from_dispatch(<Dispatch as ViewSumOps>::add_gradients(sums, radii.inner().into_dispatch(), gradient, scale)))
 }
 
-/// `sums` `[N,3]` of largest blending weights, of their squares and of views, after a view with these `weights` `[N]` and `radii`. In place if `sums` has no other
-/// owner.
+/// `sums` `[N,3]` of largest blending weights, of their squares and of views, after a view with these `weights` `[N]` and `radii`. In place if `sums` has no
+/// other owner.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other shapes.

@@ -51,8 +51,8 @@ impl Profile {
         let wanted = if name.is_empty() { PROFILES[0].name } else { name };
         PROFILES.into_iter().find(|p| p.name == wanted).ok_or_else(|| unknown_name("profile of codec cca", name, PROFILES.iter().map(|p| p.name)))
     }
-    /// The profile with the bit budgets that `settings` state in place of its own. Each may lose what the most generous profile of no more bits may lose, and below
-    /// all profiles twice as much for every bit less; otherwise a column would take more bits than it was given.
+    /// The profile with the bit budgets that `settings` state in place of its own. Each may lose what the most generous profile of no more bits may lose, and
+    /// below all profiles twice as much for every bit less; otherwise a column would take more bits than it was given.
     pub fn with(self, settings: &Settings) -> Self {
         let scalar = |bits| loss_of(bits, PROFILES.map(|p| (p.scalar_bits, p.scalar_loss)));
         let dynamic = |bits| loss_of(bits, PROFILES.map(|p| (p.dynamic_bits, p.dynamic_loss)));

@@ -159,8 +159,8 @@ pub(super) fn backward(net: &Net, parameters: &[f32], data: &Data, shard: &mut S
     }
 }
 
-/// out `[m,n]` (+)= a `[m,k]` b `[k,n]`, all row-major; a flag is set if the array holds the transpose. Pages only decode: plain loops keep the library's kernels
-/// out of what they fetch.
+/// out `[m,n]` (+)= a `[m,k]` b `[k,n]`, all row-major; a flag is set if the array holds the transpose. Pages only decode: plain loops keep the library's
+/// kernels out of what they fetch.
 #[cfg(target_arch = "wasm32")]
 fn matmul([m, n, k]: [usize; 3], (a, a_transposed): (&[f32], bool), (b, b_transposed): (&[f32], bool), out: &mut [f32], accumulate: bool) {
     assert!(a.len() == m * k && b.len() == k * n && out.len() == m * n, "matrix sizes");

@@ -1,7 +1,8 @@
 //! Damaged streams of every codec, weight codec and playback layer: an error or a sound result, never a panic, and no allocation that the limits do not allow.
 //!
-//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test, shared by its codecs and models; by default it is a second for each. With
-//! `CC4DGS_HOSTILE_CORPUS=1` it adds a case to the corpus for every outcome that the corpus does not have. A program of its own, because it watches every allocation.
+//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test, shared by its codecs and models; by default it
+//! is a second for each. With `CC4DGS_HOSTILE_CORPUS=1` it adds a case to the corpus for every outcome that the corpus does not have. A program of its own,
+//! because it watches every allocation.
 
 #[path = "../../../core/format/tests/support/allocations.rs"]
 mod allocations;

@@ -64,7 +64,8 @@ pub trait AttributeCodec: Send + Sync {
     }
     /// The largest error of each attribute. Attributes that are not listed are bit-exact.
     fn losses(&self) -> Vec<DeclaredLoss>;
-    /// Whether a decoded score is above [`CodecContext::dynamic_threshold`] if and only if the given one was, wherever the context of encoding states the threshold.
+    /// Whether a decoded score is above [`CodecContext::dynamic_threshold`] if and only if the given one was, wherever the context of encoding states the
+    /// threshold.
     fn keeps_motion(&self) -> bool {
         false
     }

@@ -17,7 +17,8 @@ fn read<T: DeserializeOwned>(section: toml::Table) -> std::result::Result<T, Str
     T::deserialize(toml::Value::Table(section)).map_err(|e| e.message().to_string())
 }
 
-/// The largest size of a section in which the key at fault is looked for: every key costs a copy. Sections that people write are smaller; stored ones may be hostile.
+/// The largest size of a section in which the key at fault is looked for: every key costs a copy. Sections that people write are smaller; stored ones may be
+/// hostile.
 const MOST_SIZE: usize = 4096;
 /// Bytes of text that count as a value.
 const TEXT_OF_VALUE: usize = 16;

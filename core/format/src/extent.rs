@@ -32,8 +32,8 @@ impl HostGaussians {
     }
 }
 
-/// The smallest depth drawn of a model whose file does not state its units (PLY, SPZ), in units of the model. `shown` is its [`HostGaussians::shown_box`]; cameras
-/// around a small model are near it. The result is at most `usual`, the near plane of the rules, and `usual` itself where the box has no size.
+/// The smallest depth drawn of a model whose file does not state its units (PLY, SPZ), in units of the model. `shown` is its [`HostGaussians::shown_box`];
+/// cameras around a small model are near it. The result is at most `usual`, the near plane of the rules, and `usual` itself where the box has no size.
 pub fn near_without_units([lower, upper]: [[f32; 3]; 2], usual: f32) -> f32 {
     let radius = 0.5 * lower.iter().zip(upper).map(|(low, high)| (f64::from(high) - f64::from(*low)).powi(2)).sum::<f64>().sqrt();
     if radius > 0.0 { usual.min((NEAR_OF_RADIUS * radius) as f32).max(LEAST_NEAR) } else { usual }

@@ -166,8 +166,8 @@ impl HostGaussians {
         let of_row = |width: usize, values: &[f32]| values[row * width..(row + 1) * width].iter().all(|v| v.is_finite());
         self.columns().iter().all(|(_, width, values)| of_row(*width, values)) && self.extra.values().all(|a| of_row(a.width, &a.values))
     }
-    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite, of Gaussians that a program made. `object` names
-    /// them in errors.
+    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite, of Gaussians that a program made. `object`
+    /// names them in errors.
     ///
     /// # Errors
     /// [`Error::Data`], [`Error::Limit`], and [`Error::Parameter`] for impossible tolerances or flags of extra attributes.

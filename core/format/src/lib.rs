@@ -2,8 +2,8 @@
 //!
 //! This crate does not depend on burn, and on `wasm32` not on C libraries. It is all that a codec or a small player needs. To add a codec, implement
 //! [`AttributeCodec`] (or [`WeightCodec`]) and submit a [`CodecPlugin`] ([`WeightCodecPlugin`]) through `inventory::submit!`. [`storage`] has building blocks
-//! that most codecs share, [`conformance`] the suites that every codec must pass. glam, inventory, serde and toml are re-exported in the versions that this crate
-//! uses.
+//! that most codecs share, [`conformance`] the suites that every codec must pass. glam, inventory, serde and toml are re-exported in the versions that this
+//! crate uses.
 
 pub mod archive;
 mod camera;

@@ -8,8 +8,8 @@ pub const BLUR: f64 = 0.3;
 /// The blurs that can be drawn, square pixels: with less the smallest footprints fall between pixels, with more images are no longer of use.
 pub const BLUR_RANGE: std::ops::RangeInclusive<f64> = 0.01..=100.0;
 
-/// The blur of a camera with focal lengths `fx` and `fy`, in pixels, for a model that was trained with `blur` on images with focal lengths up to `focal`: a longer
-/// one magnifies what training has blurred. Shorter ones, and an unknown `focal`, leave `blur` as it is.
+/// The blur of a camera with focal lengths `fx` and `fy`, in pixels, for a model that was trained with `blur` on images with focal lengths up to `focal`: a
+/// longer one magnifies what training has blurred. Shorter ones, and an unknown `focal`, leave `blur` as it is.
 pub fn blur_at(blur: f64, focal: Option<f64>, fx: f64, fy: f64) -> f64 {
     let magnified = focal.map_or(1.0, |focal| (fx * fy / (focal * focal)).max(1.0));
     (blur * magnified).min(*BLUR_RANGE.end())

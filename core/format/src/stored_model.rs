@@ -85,8 +85,8 @@ pub fn weight_seed(root: u64) -> Seed {
 /// What names and shapes of weights may take beside their values, in bytes.
 const NAMES_OF_WEIGHTS: u64 = 1 << 20;
 
-/// The weights of the deformer of `archive`, decoded by the weight codec `entry`, which must be linked; `object` names the archive in errors. Where it is known how many
-/// the deformer has by its settings, no memory is allocated for more.
+/// The weights of the deformer of `archive`, decoded by the weight codec `entry`, which must be linked; `object` names the archive in errors. Where it is known
+/// how many the deformer has by its settings, no memory is allocated for more.
 ///
 /// # Errors
 /// As [`read_gaussians`].

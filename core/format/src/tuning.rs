@@ -12,7 +12,8 @@ pub trait Rounding {
     /// # Errors
     /// What the codec reports.
     fn round(&self, gaussians: &HostGaussians) -> Result<HostGaussians>;
-    /// The distance of neighbouring values that can be stored, for every value of every column. Values with 0 stay as they are, and so do attributes of plug-ins.
+    /// The distance of neighbouring values that can be stored, for every value of every column. Values with 0 stay as they are, and so do attributes of
+    /// plug-ins.
     ///
     /// # Errors
     /// What the codec reports.
@@ -54,8 +55,8 @@ pub struct Tuning<'a> {
     pub bits_per_octave: f64,
 }
 
-/// Trains a model further on its training views: on their images, in the colours of the model where it was trained with colours per camera. A deformer's weights are
-/// rounded as their own codec stores them.
+/// Trains a model further on its training views: on their images, in the colours of the model where it was trained with colours per camera. A deformer's
+/// weights are rounded as their own codec stores them.
 pub trait TuneModel {
     /// Why the model should not be trained further unless the user asks for it, if so.
     ///

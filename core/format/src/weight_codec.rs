@@ -31,8 +31,8 @@ pub trait WeightCodec: Send + Sync {
     fn encode(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Vec<Stream>>;
     /// Decodes what [`WeightCodec::encode`] wrote: the same names and shapes in the same order, finite values. Bytes are untrusted: an error, never a panic.
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>>;
-    /// `weights` as they come back from [`WeightCodec::encode`] and [`WeightCodec::decode`], to the bit. A training that goes on while weights are rounded asks for
-    /// it in every iteration: say how where that takes less time than coding.
+    /// `weights` as they come back from [`WeightCodec::encode`] and [`WeightCodec::decode`], to the bit. A training that goes on while weights are rounded asks
+    /// for it in every iteration: say how where that takes less time than coding.
     ///
     /// # Errors
     /// As [`WeightCodec::encode`].
@@ -47,7 +47,8 @@ pub trait WeightCodec: Send + Sync {
         let _ = (weights, context);
         Ok(None)
     }
-    /// The largest absolute error of a value over the largest absolute value of its array, where the context has no importance; `0` is bit-exact. The conformance suite checks it.
+    /// The largest absolute error of a value over the largest absolute value of its array, where the context has no importance; `0` is bit-exact. The
+    /// conformance suite checks it.
     fn loss(&self) -> f64;
 }
 

@@ -15,8 +15,8 @@ pub struct AppearanceContext {
 
 /// Maps rendered planes to the planes that a camera records. Used in training only; held-out cameras and playback use the rendered image.
 pub trait Appearance: Send {
-    /// The planes `[5,H,W]` as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which the model must be the identity.
-    /// Alpha and depth are unchanged.
+    /// The planes `[5,H,W]` as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which the model must be the
+    /// identity. Alpha and depth are unchanged.
     fn apply(&self, planes: Tensor<3>, camera: Option<usize>) -> Result<Tensor<3>>;
     /// The weights, in a fixed order.
     fn parameters(&self) -> Vec<&Parameter> {

@@ -42,7 +42,8 @@ pub struct ParameterGroup {
     pub lr_end: f64,
     /// Linear warm-up from zero over this share of the stage.
     pub warmup: f64,
-    /// Whether the rates are multiplied by the extent of the cameras in the normalised frame, [`crate::Scene::extent`] (as those of the Gaussians' positions are).
+    /// Whether the rates are multiplied by the extent of the cameras in the normalised frame, [`crate::Scene::extent`] (as those of the Gaussians' positions
+    /// are).
     pub times_extent: bool,
     /// Adam's epsilon.
     pub epsilon: f64,
@@ -133,8 +134,8 @@ impl SpatialInput {
 }
 
 /// A number or vector per Gaussian that a deformer learns in addition to its weights. It is one of the Gaussians' extra attributes: density control copies and
-/// removes it with its Gaussian, and checkpoints and archives store it by name. It begins with the main stage. Gaussians that key frames or recovery add take the
-/// value of the nearest moving one.
+/// removes it with its Gaussian, and checkpoints and archives store it by name. It begins with the main stage. Gaussians that key frames or recovery add take
+/// the value of the nearest moving one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AttributeSpec {
     /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and not one of the attributes that every Gaussian has.
@@ -195,8 +196,8 @@ pub fn check_attributes(deformer: &str, attributes: &[AttributeSpec]) -> Result<
     Ok(())
 }
 
-/// Refuses weights that can be neither trained nor stored: names that are empty, not printable or used twice, values that are not as many as the shape says, and
-/// groups that do not exist. `owner` names the plug-in in errors.
+/// Refuses weights that can be neither trained nor stored: names that are empty, not printable or used twice, values that are not as many as the shape says,
+/// and groups that do not exist. `owner` names the plug-in in errors.
 ///
 /// # Errors
 /// [`Error::Parameter`] that names the plug-in and the array.
@@ -238,8 +239,8 @@ pub fn start_deformer(name: &str, deformer: &mut dyn Deformer, first: &HostGauss
 ///
 /// The time-invariant half is a separate call, so that playback can cache it. Training recomputes it every step.
 pub trait Deformer: Send {
-    /// Features of M Gaussians, from their centres and the attributes of [`Deformer::attributes`]. Those of a Gaussian do not depend on which others are in `input`:
-    /// training, playback and baking ask about different ones.
+    /// Features of M Gaussians, from their centres and the attributes of [`Deformer::attributes`]. Those of a Gaussian do not depend on which others are in
+    /// `input`: training, playback and baking ask about different ones.
     ///
     /// # Errors
     /// [`Error::Parameter`] for Gaussians without these attributes, as [`SpatialInput::check`] returns it.
@@ -254,7 +255,8 @@ pub trait Deformer: Send {
     /// # Errors
     /// [`Error::Parameter`] for a time that is not finite.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
-    /// The offsets of [`Deformer::deform`] at each of `times_norm`. Training asks for all views of an iteration at once, so that work and gradients can be shared.
+    /// The offsets of [`Deformer::deform`] at each of `times_norm`. Training asks for all views of an iteration at once, so that work and gradients can be
+    /// shared.
     fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
         times_norm.iter().map(|&time_norm| self.deform(features.clone(), time_norm)).collect()
     }
@@ -276,24 +278,24 @@ pub trait Deformer: Send {
     fn is_static(&self) -> bool {
         false
     }
-    /// An additional loss term `[1]` for the moving Gaussians, added as it is. It is asked for once per iteration, with the time `time_norm` (0..1) of the first view
-    /// of that iteration and the `progress` (0..1) of the main stage. It may call [`Deformer::deform`] at other times, to compare several. Add many numbers with
-    /// [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
+    /// An additional loss term `[1]` for the moving Gaussians, added as it is. It is asked for once per iteration, with the time `time_norm` (0..1) of the
+    /// first view of that iteration and the `progress` (0..1) of the main stage. It may call [`Deformer::deform`] at other times, to compare several. Add many
+    /// numbers with [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
-    /// Sets initial weights that depend on the first Gaussians, such as control points. A training calls it once, on a new deformer before the main stage; stored
-    /// models are opened without it, and their weights are replaced by name. So it may change nothing but values of weights: their names and shapes depend on
-    /// settings and context alone, whatever the number of Gaussians. `first` are those that may move, or all if none may: there may be few, or none, all values are
-    /// finite, and attributes of plug-ins may be missing. Equal Gaussians must give equal weights: draw random numbers from [`DeformerContext::seed`].
-    /// Default: nothing.
+    /// Sets initial weights that depend on the first Gaussians, such as control points. A training calls it once, on a new deformer before the main stage;
+    /// stored models are opened without it, and their weights are replaced by name. So it may change nothing but values of weights: their names and shapes
+    /// depend on settings and context alone, whatever the number of Gaussians. `first` are those that may move, or all if none may: there may be few, or none,
+    /// all values are finite, and attributes of plug-ins may be missing. Equal Gaussians must give equal weights: draw random numbers from
+    /// [`DeformerContext::seed`]. Default: nothing.
     fn start_from(&mut self, _first: &HostGaussians) -> Result<()> {
         Ok(())
     }
     /// Sets the progress of the main stage of training, 0..1; called before every step. A deformer without such a call has progress 1, as after training.
     fn set_progress(&mut self, _progress: f32) {}
-    /// After training, a smaller deformer with nearly the same offsets, without parts that this scene does not use; `None` if there is none. `features` `[M,F]` are
-    /// those of all moving Gaussians, `times` the normalised times of the frames.
+    /// After training, a smaller deformer with nearly the same offsets, without parts that this scene does not use; `None` if there is none. `features` `[M,F]`
+    /// are those of all moving Gaussians, `times` the normalised times of the frames.
     fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {
         Ok(None)
     }

@@ -1,7 +1,7 @@
 //! Density control: which Gaussians are added, moved and removed during training.
 //!
-//! A control observes statistics of rendered views and returns a [`DensityPlan`]. The trainer executes the plan, so that the trainer alone handles attributes of
-//! plug-ins, optimizer state and checkpoints.
+//! A control observes statistics of rendered views and returns a [`DensityPlan`]. The trainer executes the plan, so that the trainer alone handles attributes
+//! of plug-ins, optimizer state and checkpoints.
 
 use crate::Plugin;
 use crate::gaussians::to_vec;
@@ -99,8 +99,8 @@ impl DensityPlan {
     pub fn keep(&mut self, row: usize) -> usize {
         self.add(row, false)
     }
-    /// Adds a Gaussian with the attributes of the old row `parent` and no momentum in the optimizer; returns its new row. A split is two copies with new values, without
-    /// [`DensityPlan::keep`] of the parent. A relocation is a copy instead of keeping a dead row.
+    /// Adds a Gaussian with the attributes of the old row `parent` and no momentum in the optimizer; returns its new row. A split is two copies with new
+    /// values, without [`DensityPlan::keep`] of the parent. A relocation is a copy instead of keeping a dead row.
     pub fn copy(&mut self, parent: usize) -> usize {
         self.add(parent, true)
     }
@@ -198,8 +198,8 @@ impl DensityPlan {
         let attributes = changed.collect::<Result<Vec<_>>>()?;
         Gaussians::from_attributes(gaussians.sh_degree, attributes)
     }
-    /// Refuses plans that refer to rows or attributes that `gaussians` do not have, remove all Gaussians, or set values that are not finite. `control` is the name in
-    /// errors.
+    /// Refuses plans that refer to rows or attributes that `gaussians` do not have, remove all Gaussians, or set values that are not finite. `control` is the
+    /// name in errors.
     ///
     /// # Errors
     /// [`Error::Backend`].
@@ -244,30 +244,30 @@ fn index_tensor(rows: &[usize], device: &Device) -> Tensor<1, Int> {
 /// Adds, moves and removes Gaussians during the coarse and the main stage. It owns its settings, its statistics, and its state in checkpoints.
 ///
 /// A stage begins with [`begin_stage`](Self::begin_stage). The calls of an iteration are, in this order: [`statistics`](Self::statistics),
-/// [`observe`](Self::observe) for every view, the step of the optimizer, [`after_step`](Self::after_step), [`hold`](Self::hold), [`plan`](Self::plan), and, if there
-/// is a plan, [`executed`](Self::executed). Between iterations, and before the first one, `executed` is also called for plans of the trainer, which
+/// [`observe`](Self::observe) for every view, the step of the optimizer, [`after_step`](Self::after_step), [`hold`](Self::hold), [`plan`](Self::plan), and, if
+/// there is a plan, [`executed`](Self::executed). Between iterations, and before the first one, `executed` is also called for plans of the trainer, which
 /// [`plan`](Self::plan) did not return. Where a run is resumed, a new control gets [`restore`](Self::restore) in place of `begin_stage`.
 pub trait DensityControl: Send {
-    /// A stage begins with `count` Gaussians: statistics start from zero. Also called before [`DensityControl::restore`] where the trainer goes back to an earlier
-    /// state of the stage.
+    /// A stage begins with `count` Gaussians: statistics start from zero. Also called before [`DensityControl::restore`] where the trainer goes back to an
+    /// earlier state of the stage.
     fn begin_stage(&mut self, count: usize, device: &Device);
     /// The optional statistics that it needs from the views of this iteration.
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic>;
     /// Receives the statistics of one view, after the backward pass.
     fn observe(&mut self, view: &ViewStatistics) -> Result<()>;
-    /// Called before every [`DensityControl::plan`]: growth must stay `count` Gaussians below its upper bound. That many were removed, and training views do not have
-    /// their earlier PSNR yet. Default: ignored, for controls that replace what they remove in the same plan.
+    /// Called before every [`DensityControl::plan`]: growth must stay `count` Gaussians below its upper bound. That many were removed, and training views do
+    /// not have their earlier PSNR yet. Default: ignored, for controls that replace what they remove in the same plan.
     fn hold(&mut self, _count: usize) {}
-    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`]) and puts
-    /// those that move first, executes it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
+    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`])
+    /// and puts those that move first, executes it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
     /// The Gaussians are now those of `plan`: statistics per Gaussian must follow its rows ([`DensityPlan::parents`] are the old ones, in any order). It may be
     /// another plan than [`DensityControl::plan`] returned last. Default: nothing, for controls that keep none.
     fn executed(&mut self, _plan: &DensityPlan, _device: &Device) -> Result<()> {
         Ok(())
     }
-    /// Called after every optimizer step, before [`DensityControl::plan`]. Returns attributes with new values for all rows `[N,width]`; their optimizer state is
-    /// kept (for the noise of 3DGS-MCMC).
+    /// Called after every optimizer step, before [`DensityControl::plan`]. Returns attributes with new values for all rows `[N,width]`; their optimizer state
+    /// is kept (for the noise of 3DGS-MCMC).
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
     }

@@ -134,8 +134,8 @@ mod adapter {
         Err(Error::unsupported("device wgpu", problem, "Install a Vulkan driver (mesa-vulkan-drivers for a software one), or use --device flex"))
     }
 
-    /// Ends the process without the static destructors of graphics drivers. Mesa's software driver destroys its compiler while a thread may still be compiling kernels
-    /// with it; about one process in four crashed at exit.
+    /// Ends the process without the static destructors of graphics drivers. Mesa's software driver destroys its compiler while a thread may still be compiling
+    /// kernels with it; about one process in four crashed at exit.
     fn end_without_destructors() {
         #[cfg(all(target_os = "linux", target_env = "gnu"))]
         {

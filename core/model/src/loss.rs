@@ -8,14 +8,14 @@ use burn::tensor::{Int, Tensor};
 #[derive(Clone, Copy)]
 #[non_exhaustive]
 pub struct LossInput<'a> {
-    /// Rendered planes `[5,H,W]`: red, green, blue as the camera records them (after the appearance model), alpha, depth. Depth is the sum of blending weight times
-    /// z, not divided by alpha. Gradients flow through them. In the score stage (`[score_loss]`) the first three are the blended dynamic scores, and gradients reach
-    /// nothing else.
+    /// Rendered planes `[5,H,W]`: red, green, blue as the camera records them (after the appearance model), alpha, depth. Depth is the sum of blending weight
+    /// times z, not divided by alpha. Gradients flow through them. In the score stage (`[score_loss]`) the first three are the blended dynamic scores, and
+    /// gradients reach nothing else.
     pub planes: &'a Tensor<3>,
     /// Recorded planes `[3,H,W]` in 0..1, or the mask `[1,H,W]` of the score stage.
     pub target: &'a Tensor<3>,
-    /// Recorded depth `[1,H,W]`: along the z axis of the camera, in units of the scene, 0 where it is unknown. The rendered depth plane is to be compared with its
-    /// product with alpha. `None` where the view has none, in the score stage, and unless a term [wants it](LossTerm::wants_depth).
+    /// Recorded depth `[1,H,W]`: along the z axis of the camera, in units of the scene, 0 where it is unknown. The rendered depth plane is to be compared with
+    /// its product with alpha. `None` where the view has none, in the score stage, and unless a term [wants it](LossTerm::wants_depth).
     pub depth: Option<&'a Tensor<3>>,
     /// The camera of the view, at the size of the planes. Its name is that of the dataset.
     pub camera: &'a Camera,
@@ -24,9 +24,9 @@ pub struct LossInput<'a> {
     /// The Gaussians as rendered at this time, with their attributes (opacities and scales before activation). Gradients flow through them. Attributes of a
     /// deformer are in [`Gaussians::extra`] during the main stage only.
     pub gaussians: &'a Gaussians,
-    /// The same Gaussians before the deformer, row by row, with the same attributes; where nothing moves they are equal. Gradients flow through them, as through
-    /// `gaussians`, to the values that training learns. With `train.sparse_adam` (the default) an iteration changes only Gaussians that one of its views shows.
-    /// Where offsets are added, the difference of the two has a gradient for the deformer alone.
+    /// The same Gaussians before the deformer, row by row, with the same attributes; where nothing moves they are equal. Gradients flow through them, as
+    /// through `gaussians`, to the values that training learns. With `train.sparse_adam` (the default) an iteration changes only Gaussians that one of its
+    /// views shows. Where offsets are added, the difference of the two has a gradient for the deformer alone.
     pub canonical: &'a Gaussians,
     /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
     pub radii: &'a Tensor<1, Int>,
@@ -61,8 +61,8 @@ impl<'a> LossInput<'a> {
 
 /// One term of the loss.
 pub trait LossTerm: Send {
-    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training. It is a mean over
-    /// pixels or Gaussians, not a sum, so that weights mean the same at every image size and number of Gaussians. Add many numbers with
+    /// The value `[1]` for one view, without its weight; `None` if the term does not apply. Any other shape, and any error, ends the training. It is a mean
+    /// over pixels or Gaussians, not a sum, so that weights mean the same at every image size and number of Gaussians. Add many numbers with
     /// [`ordered_sum`](crate::ordered_sum), whose bits do not depend on threads, and divide by their count.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
     /// Whether the term compares recorded depth, [`LossInput::depth`]. It is read for terms that do. Training refuses a scene without it.

@@ -67,8 +67,8 @@ where
         self.regularizer = Some(Box::new(term));
         self
     }
-    /// Sets initial weights that depend on the first Gaussians: `start(module, first)` returns the module with weights of the same shapes. Nothing else of it is
-    /// kept; see [`Deformer::start_from`].
+    /// Sets initial weights that depend on the first Gaussians: `start(module, first)` returns the module with weights of the same shapes. Nothing else of it
+    /// is kept; see [`Deformer::start_from`].
     pub fn with_start(mut self, start: impl Fn(M, &HostGaussians) -> Result<M> + Send + 'static) -> Self {
         self.start = Some(Box::new(start));
         self
@@ -78,8 +78,8 @@ where
         self.progress = Some(Box::new(change));
         self
     }
-    /// Counts weights whose path starts with `prefix` as grid, and puts them into an optimizer group of their own if `group` is given. A path that no weight has is
-    /// an error as for [`ModuleDeformer::with_group`].
+    /// Counts weights whose path starts with `prefix` as grid, and puts them into an optimizer group of their own if `group` is given. A path that no weight
+    /// has is an error as for [`ModuleDeformer::with_group`].
     pub fn with_grid(mut self, prefix: &str, group: Option<ParameterGroup>) -> Self {
         self.change(prefix, |parameter| parameter.part = Part::Grid);
         match group {

@@ -84,7 +84,8 @@ impl Offsets {
             "Lower the deformer's learning rates, or limit what the head returns",
         ))
     }
-    /// The first head of which more than the share `tolerated` of the rows is not finite. Reads one number per head back from the device, and heads that are not finite.
+    /// The first head of which more than the share `tolerated` of the rows is not finite. Reads one number per head back from the device, and heads that are
+    /// not finite.
     ///
     /// # Errors
     /// [`Error::Backend`] that names `deformer` and the head, if the device fails.
@@ -185,8 +186,8 @@ impl Offsets {
         }
         moved
     }
-    /// Applies the offsets to `moving` `[M]` and writes the results to the first M Gaussians of `frame` `[N >= M]`. The update is in place if `frame` holds the only
-    /// reference. Attributes that no head changes and all other Gaussians stay unchanged.
+    /// Applies the offsets to `moving` `[M]` and writes the results to the first M Gaussians of `frame` `[N >= M]`. The update is in place if `frame` holds the
+    /// only reference. Attributes that no head changes and all other Gaussians stay unchanged.
     ///
     /// # Errors
     /// As [`Offsets::apply`].

@@ -34,9 +34,9 @@ pub struct OptimizerState {
 
 /// Updates named arrays by their gradients.
 pub trait Optimizer: Send {
-    /// The values after one step. `value` and `gradient` are `[N,W]`, tensors without autodiff; a new array starts with zero state. In fine-tuning, where values are
-    /// rounded, `value` is 0 and the caller adds the step to the values, in units of their quantisation steps: terms that depend on the size of values, such as
-    /// weight decay, have no effect there.
+    /// The values after one step. `value` and `gradient` are `[N,W]`, tensors without autodiff; a new array starts with zero state. In fine-tuning, where
+    /// values are rounded, `value` is 0 and the caller adds the step to the values, in units of their quantisation steps: terms that depend on the size of
+    /// values, such as weight decay, have no effect there.
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
     /// Removes the state of all arrays that `path` holds ([`path_holds`]).
     fn restart(&mut self, path: &str);

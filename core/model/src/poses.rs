@@ -20,13 +20,13 @@ pub struct PosesContext {
 pub struct Posed {
     /// The camera with the corrected [`Camera::world_to_camera`], which is rigid again; the rest is as it was.
     pub camera: Camera,
-    /// A tensor `[4,4]` whose values do not count. The rasterizer hands it d loss / d world_to_camera ([`Splats::camera_probe`](crate::Splats::camera_probe)), and it hands
-    /// that on to the weights.
+    /// A tensor `[4,4]` whose values do not count. The rasterizer hands it d loss / d world_to_camera ([`Splats::camera_probe`](crate::Splats::camera_probe)),
+    /// and it hands that on to the weights.
     pub probe: Tensor<2>,
 }
 
-/// Corrects the poses of training cameras. Used in training only: held-out cameras and playback have the poses of the dataset. So a model must not be able to turn or
-/// move all cameras together, which would move what the run learns away from them.
+/// Corrects the poses of training cameras. Used in training only: held-out cameras and playback have the poses of the dataset. So a model must not be able to
+/// turn or move all cameras together, which would move what the run learns away from them.
 pub trait Poses: Send {
     /// Training camera `index` (0-based), which the dataset gives as `camera`; `None` where its pose stays as it is.
     ///

@@ -12,8 +12,8 @@ pub enum PresetRole {
         /// Whether its sizes are for two cores, so that a method's `cpu` table applies too.
         small: bool,
     },
-    /// Changes to a family by a method. The layer has a table `all` for all families, one per dataset that differs, and one for `cpu` sizes. Tables of the same names
-    /// in `published` say how the method is published, beside its sizes: families that plan for themselves leave them out.
+    /// Changes to a family by a method. The layer has a table `all` for all families, one per dataset that differs, and one for `cpu` sizes. Tables of the same
+    /// names in `published` say how the method is published, beside its sizes: families that plan for themselves leave them out.
     Method,
 }
 

@@ -92,9 +92,9 @@ pub struct RenderSettings {
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
-    /// Capacity in (Gaussian, tile) pairs, for devices that would otherwise wait until the count of every image was read back. Pairs beyond it are not drawn, those
-    /// of the farthest Gaussians first, and gradients are wrong then; [`RenderStats::pair_count`] has the true count. Neither image nor gradients depend on
-    /// a capacity that suffices. `None`, or more than the device's limit, draws all pairs.
+    /// Capacity in (Gaussian, tile) pairs, for devices that would otherwise wait until the count of every image was read back. Pairs beyond it are not drawn,
+    /// those of the farthest Gaussians first, and gradients are wrong then; [`RenderStats::pair_count`] has the true count. Neither image nor gradients depend
+    /// on a capacity that suffices. `None`, or more than the device's limit, draws all pairs.
     pub pair_capacity: Option<usize>,
 }
 
@@ -160,8 +160,8 @@ pub trait Rasterizer: Send + Sync {
     /// rayon's threads: hold no lock while a parallel loop runs.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for shapes and settings that do not fit, [`Error::Limit`] for sizes that the device cannot hold, [`Error::Unsupported`] for a device
-    /// without this rasterizer.
+    /// [`Error::Parameter`] for shapes and settings that do not fit, [`Error::Limit`] for sizes that the device cannot hold, [`Error::Unsupported`] for a
+    /// device without this rasterizer.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
     /// Planes `[3,H,W]` in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
     fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {

@@ -154,8 +154,8 @@ impl Registry {
     /// false or a table of its settings.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for an unknown `kind`, for a layer whose key holds something else, and for attributes and weights that can be neither trained nor stored
-    /// ([`check_attributes`], [`check_parameters`]), and what the plug-ins report.
+    /// [`Error::Parameter`] for an unknown `kind`, for a layer whose key holds something else, and for attributes and weights that can be neither trained nor
+    /// stored ([`check_attributes`], [`check_parameters`]), and what the plug-ins report.
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
         let (kind, mut settings) = split_kind("deformer", section)?;
         let layers = self.take_layers(&mut settings)?;

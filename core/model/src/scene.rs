@@ -53,8 +53,8 @@ pub struct PointCloud {
 /// Loads the image of a view. Implementations read files or trace rays; they do not cache.
 pub trait FrameSource: Send + Sync {
     /// The image of `view`, at the size of its camera. The source of a [`Scene`] returns images without lens distortion; that of a reader
-    /// ([`ImageSource::Frames`](crate::ImageSource::Frames)) returns them as they were taken, and they are undistorted later. Views are asked for in any order, more
-    /// than once, and from several threads at a time.
+    /// ([`ImageSource::Frames`](crate::ImageSource::Frames)) returns them as they were taken, and they are undistorted later. Views are asked for in any order,
+    /// more than once, and from several threads at a time.
     ///
     /// # Errors
     /// [`Error::Data`] for an image that cannot be read, [`Error::Parameter`] for a view that does not exist.

@@ -1,4 +1,5 @@
-//! How the weights of a field are stored: `name`, `name:setting=value`, or `name:max-drop=0.01dB`, which searches the fewest bits of each array that keep the PSNR.
+//! How the weights of a field are stored: `name`, `name:setting=value`, or `name:max-drop=0.01dB`, which searches the fewest bits of each array that keep the
+//! PSNR.
 
 use crate::archive::{load_weights, weights_of};
 use crate::codec_services::{ModelServices, SceneViews};
@@ -160,7 +161,8 @@ impl<'a> StoredField<'a> {
 }
 
 impl FieldWeights {
-    /// The settings of the weight codec for `model`, searched on the views of `scene` that judge where the loss was stated. `importance` is [`FieldWeights::importance`].
+    /// The settings of the weight codec for `model`, searched on the views of `scene` that judge where the loss was stated. `importance` is
+    /// [`FieldWeights::importance`].
     ///
     /// # Errors
     /// As [`Model::save_archive`].

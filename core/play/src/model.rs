@@ -51,8 +51,8 @@ impl ModelDeformer {
     }
 }
 
-/// Sizes in bytes. For archives, PLY and SPZ files these are bytes on disk, headers included in `total`; for a checkpoint and a pruned model the float32 size of
-/// what playback needs.
+/// Sizes in bytes. For archives, PLY and SPZ files these are bytes on disk, headers included in `total`; for a checkpoint and a pruned model the float32 size
+/// of what playback needs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ModelSize {
     /// Weights of the field: spatial encoding (the paper's Deform-Grid).

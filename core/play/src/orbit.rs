@@ -91,8 +91,8 @@ pub(crate) fn checked(cameras: Vec<Camera>, middle: [f64; 3], distance: f64) -> 
     Ok(cameras)
 }
 
-/// The median of the centres and the distance within which [`SHARE`] of them lie: a background far away must not push the camera out. If the Gaussians themselves
-/// are larger than that, such as a single one, it is their size instead. 1 for models without either.
+/// The median of the centres and the distance within which [`SHARE`] of them lie: a background far away must not push the camera out. If the Gaussians
+/// themselves are larger than that, such as a single one, it is their size instead. 1 for models without either.
 pub(crate) fn middle_and_radius(gaussians: &HostGaussians) -> ([f64; 3], f64) {
     let mut kept: Vec<usize> = (0..gaussians.len()).filter(|&i| gaussians.opacity_logits[i] > FAINT_LOGIT).collect();
     if kept.is_empty() {

@@ -12,8 +12,8 @@ const RUNS: [f64; 2] = [4.6, 4.9];
 
 /// Views all round a model, each of a camera and a time of its own. Nothing was recorded there: they have no images.
 ///
-/// Directions are evenly spread over a sphere, and times over 0..1, which count where the model moves. Every so many views, where that leaves 8 or more, are from
-/// all sides and of nearly all of the time.
+/// Directions are evenly spread over a sphere, and times over 0..1, which count where the model moves. Every so many views, where that leaves 8 or more, are
+/// from all sides and of nearly all of the time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OrbitViews {
     views: Vec<(Camera, f32)>,

@@ -25,8 +25,8 @@ fn storable(camera: &Camera) -> Camera {
     out
 }
 
-/// The presentation of `model`, which was recorded by `cameras`, all in its coordinates. The first is the home camera; the others are thinned out to the number that
-/// archives hold. Trained models have what their cameras look at in the origin; of others it is their middle.
+/// The presentation of `model`, which was recorded by `cameras`, all in its coordinates. The first is the home camera; the others are thinned out to the number
+/// that archives hold. Trained models have what their cameras look at in the origin; of others it is their middle.
 pub fn of_recorded(model: &Model, cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
     let target = if model.normalisation == Similarity::IDENTITY { middle_and_radius(&model.gaussians).0 } else { [0.0; 3] };
     Presentation { target: Some(target.map(|v| rounded(v) as f32)), ..of_cameras(cameras, up) }

@@ -33,7 +33,8 @@ pub struct PruneReport {
     pub views: usize,
 }
 
-/// Contribution of each Gaussian: the mean over training views, at their times, of the sum over pixels of its squared blending weight (with what shines through it).
+/// Contribution of each Gaussian: the mean over training views, at their times, of the sum over pixels of its squared blending weight (with what shines through
+/// it).
 pub fn contributions(model: &Model, scene: &Scene, registry: &Registry, device: &Device, events: &dyn EventSink) -> Result<Vec<f64>> {
     // Without Gaussians there is nothing to differentiate by.
     if model.gaussians.is_empty() {

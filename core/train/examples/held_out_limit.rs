@@ -1,5 +1,5 @@
-//! How well a held-out camera of a built-in scene can be drawn from what its training cameras see, if the surfaces are known: each pixel is traced, and gets the
-//! colours that the training cameras have where they see the same point. What a training reaches beyond that is guessed; what it misses is its own fault.
+//! How well a held-out camera of a built-in scene can be drawn from what its training cameras see, if the surfaces are known: each pixel is traced, and gets
+//! the colours that the training cameras have where they see the same point. What a training reaches beyond that is guessed; what it misses is its own fault.
 //!
 //! `held_out_limit NAME [FRAMES]`, where NAME is a built-in scene such as `captures/units:7`, and FRAMES how many frames of each held-out camera are drawn.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]

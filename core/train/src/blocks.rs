@@ -25,8 +25,8 @@ pub struct BlockScore {
     pub worst_psnr_db: f64,
 }
 
-/// What a fixed camera usually sees: the median over time of every pixel and channel; of an even number of frames the upper one of the two in the middle. Stored
-/// results depend on that: the mean of the two would change which blocks move.
+/// What a fixed camera usually sees: the median over time of every pixel and channel; of an even number of frames the upper one of the two in the middle.
+/// Stored results depend on that: the mean of the two would change which blocks move.
 pub struct UsualImage {
     width: usize,
     height: usize,

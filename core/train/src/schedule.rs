@@ -103,7 +103,8 @@ impl StageLengths {
     pub fn set_pass(&mut self, stage: Stage, iterations: usize) {
         self.passes[stage as usize] = iterations.max(1);
     }
-    /// Size per axis of the images of an iteration, as a share of their full one, where `before` is the iteration before. Scores are always fitted to full ones.
+    /// Size per axis of the images of an iteration, as a share of their full one, where `before` is the iteration before. Scores are always fitted to full
+    /// ones.
     fn image_scale(&self, before: Schedule) -> f32 {
         let (stage, [coarse, _, main]) = (before.stage, self.lengths);
         let done = if stage == Stage::Main { coarse as f64 + main as f64 * before.progress() } else { before.iteration as f64 };

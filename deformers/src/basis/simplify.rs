@@ -135,7 +135,8 @@ fn rebuilt(field: &Basis, plans: &[Plan]) -> Result<Basis> {
     Ok(small)
 }
 
-/// A head's layers without some functions: hidden layers are unchanged, of the last layer's W `[width, outputs x functions]` and b only the kept columns are left.
+/// A head's layers without some functions: hidden layers are unchanged, of the last layer's W `[width, outputs x functions]` and b only the kept columns are
+/// left.
 fn head_weights(values: &[f32], (outputs, own): (usize, usize), width: usize, kept: &[usize]) -> Vec<f32> {
     let first = values.len() - (width + 1) * outputs * own;
     let mut out = values[..first].to_vec();

@@ -14,8 +14,8 @@ const LEAST_SQUARED_NORM: f32 = 1e-12;
 /// Lower bound on the half diagonal of the box, world units.
 const LEAST_SCALE: f32 = 1e-6;
 
-/// `weight` times the sum over heads and functions of penalty times norm. Norms of centres are in half diagonals of the box, so that the result does not depend on
-/// the scene's unit of length.
+/// `weight` times the sum over heads and functions of penalty times norm. Norms of centres are in half diagonals of the box, so that the result does not depend
+/// on the scene's unit of length.
 pub(super) fn group_lasso(field: &Basis, weight: f32) -> Option<Tensor<1>> {
     let prices = field.functions.prices();
     let width = field.coefficients.trunk.last().copied()?;

@@ -1,7 +1,7 @@
 //! Offsets at the times of an iteration, without the coefficients of all functions of time.
 //!
-//! The last layer of a head is linear, and so is the sum over functions behind it: C(f) φ(t) = (h(f) W + b) φ(t) = h(f) (W φ(t)) + b φ(t). Combined first, the layer
-//! has an output per offset and time in place of one per offset and function. A head has some 30 functions, and an iteration one to eight times.
+//! The last layer of a head is linear, and so is the sum over functions behind it: C(f) φ(t) = (h(f) W + b) φ(t) = h(f) (W φ(t)) + b φ(t). Combined first, the
+//! layer has an output per offset and time in place of one per offset and function. A head has some 30 functions, and an iteration one to eight times.
 
 use super::Basis;
 use burn::tensor::{Int, Tensor, TensorData};

@@ -54,7 +54,8 @@ impl Formulas<'_> {
         let found = self.0.parameters.iter().find(|p| p.name == name).map(|p| p.value.clone());
         found.ok_or_else(|| Error::backend("deformer cdf", format!("it has no weights {name}"), "Report this as a defect"))
     }
-    /// f_voxel `[M, width]` of `means_world` `[M,3]` on the device of the weights. Cells and signatures are computed on the host, by the same functions as in [`Cdf`].
+    /// f_voxel `[M, width]` of `means_world` `[M,3]` on the device of the weights. Cells and signatures are computed on the host, by the same functions as in
+    /// [`Cdf`].
     fn voxels(&self, means_world: &Tensor<2>, device: &Device) -> Result<Tensor<2>> {
         let mut levels = Vec::new();
         let m = means_world.dims()[0];

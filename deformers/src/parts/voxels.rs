@@ -1,5 +1,5 @@
-//! Features of canonical centres without stored tables (paper Section IV-B). The vertices of a multi-resolution grid have hash signatures. One small decoder per
-//! level turns signatures into features. A centre interpolates the features of its eight corners.
+//! Features of canonical centres without stored tables (paper Section IV-B). The vertices of a multi-resolution grid have hash signatures. One small decoder
+//! per level turns signatures into features. A centre interpolates the features of its eight corners.
 
 pub use cc4dgs_fields::voxels::{VoxelSettings, VoxelSizes};
 

@@ -33,7 +33,8 @@ try {
 /// Longest text that a browser (V8) holds, in characters.
 const MOST_TEXT: usize = (1 << 29) - 24;
 
-/// Says what would leave the page blank: browsers without import maps or `DecompressionStream`, and files that end before the end of the script that starts the player.
+/// Says what would leave the page blank: browsers without import maps or `DecompressionStream`, and files that end before the end of the script that starts the
+/// player.
 const BLANK: &str = r#"<script>
 if (!window.DecompressionStream || !HTMLScriptElement.supports || !HTMLScriptElement.supports("importmap")) document.getElementById("player").textContent =
     "This page needs a newer browser: Chrome or Edge 96, Firefox 113, Safari 16.4, or later.";

@@ -1,7 +1,7 @@
 //! `web`: the model with the player, as one HTML file that opens from disk without a network, or as a folder for any static server.
 //!
-//! The player's page is built apart from this program (`apps/player/build-web`); [`Page`] finds it. The archive is stored with the deformer's weights where the page
-//! can compute the motion from them, else with a playback layer and without the deformer.
+//! The player's page is built apart from this program (`apps/player/build-web`); [`Page`] finds it. The archive is stored with the deformer's weights where the
+//! page can compute the motion from them, else with a playback layer and without the deformer.
 
 mod html;
 mod page;

@@ -22,8 +22,8 @@ pub const PAGE_FILES: [&str; 11] = [
     "cc4dgs_player.js",
     "cc4dgs_player_bg.wasm",
 ];
-/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights, version 3 draws with the blur of the model,
-/// and version 4 has `device.js` and `shaders.js`.
+/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights, version 3 draws with the blur of the
+/// model, and version 4 has `device.js` and `shaders.js`.
 pub const PAGE_VERSION: u32 = 4;
 /// Upper bound on the size of a file of the page, in bytes.
 const MOST_BYTES: u64 = 64 << 20;

@@ -73,7 +73,8 @@ impl Space {
             Self::Stored(settings) => settings.shape()?.parameter_count(),
         })
     }
-    /// Width and hidden layers of the coefficient network where settings state none. Stored features are weights themselves, so that one narrow layer is enough.
+    /// Width and hidden layers of the coefficient network where settings state none. Stored features are weights themselves, so that one narrow layer is
+    /// enough.
     pub(super) fn network(&self) -> (usize, usize) {
         match self {
             Self::Computed(settings) => (settings.capacity.width(), 2),

@@ -1,7 +1,7 @@
 //! A 3x3 matrix and an offset per training camera: exposure, white balance and flare.
 //!
-//! Camera c records (I + D_c - mean D) rgb + (b_c - mean b). The mean over the training cameras is the identity by construction, so that the model cannot move a colour change
-//! common to all cameras out of the Gaussians. Held-out cameras see the rendered image, which is the mean.
+//! Camera c records (I + D_c - mean D) rgb + (b_c - mean b). The mean over the training cameras is the identity by construction, so that the model cannot move
+//! a colour change common to all cameras out of the Gaussians. Held-out cameras see the rendered image, which is the mean.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::colors::{NUMBERS, affine_colors};

@@ -21,7 +21,8 @@ impl Statistics {
     /// Adds the screen gradients of one view: the absolute ones where they were collected, else the signed ones.
     pub fn add_gradients(&mut self, view: &ViewStatistics) -> Result<()> {
         if let Some(gradient) = view.absolute_screen_gradient.as_ref().or(view.screen_gradient.as_ref()) {
-            // Converts the gradient per pixel of a loss divided by the number of views to the gradient of the view's own loss per unit of normalised device coordinates.
+            // Converts the gradient per pixel of a loss divided by the number of views to the gradient of the view's own loss per unit of normalised device
+            // coordinates.
             let scale = view.views as f32 * 0.5;
             let scale = [scale * view.size.0 as f32, scale * view.size.1 as f32];
             // Moved out, so that this is the only reference and the kernel changes the tensor in place.
@@ -45,8 +46,8 @@ impl Statistics {
     pub fn len(&self) -> usize {
         self.max_weight.dims()[0]
     }
-    /// The statistics with which the Gaussians of `plan` start. Gradients start from zero after every round, weights after a weight pruning. New Gaussians have no
-    /// weights yet; weight 1 protects them from the next weight pruning.
+    /// The statistics with which the Gaussians of `plan` start. Gradients start from zero after every round, weights after a weight pruning. New Gaussians have
+    /// no weights yet; weight 1 protects them from the next weight pruning.
     pub fn after(&self, plan: &DensityPlan, weights_restart: bool, device: &Device) -> Result<Self> {
         let count = plan.len();
         let mut next = Self::zeros(count, device);

@@ -1,4 +1,5 @@
-//! Loss term: mean standard deviation of the Gaussians, divided by the extent of the cameras in the normalised frame. It favours few and small Gaussians (3DGS-MCMC).
+//! Loss term: mean standard deviation of the Gaussians, divided by the extent of the cameras in the normalised frame. It favours few and small Gaussians
+//! (3DGS-MCMC).
 
 use burn::tensor::Tensor;
 

@@ -1,15 +1,15 @@
 //! A small rotation and translation per training camera, learned with everything else.
 //!
-//! Camera c turns by the rotation vector w_c - mean w about its own centre, and its centre moves by t_c - mean t, both in world axes. The average motion of the training
-//! cameras is zero by construction, so that cameras and model cannot turn or move together, away from the held-out cameras. They could still grow together, which
-//! the regularizer holds back.
+//! Camera c turns by the rotation vector w_c - mean w about its own centre, and its centre moves by t_c - mean t, both in world axes. The average motion of the
+//! training cameras is zero by construction, so that cameras and model cannot turn or move together, away from the held-out cameras. They could still grow
+//! together, which the regularizer holds back.
 //!
 //! The means are over the cameras that were trained on so far: those with a number that is not zero. The coarse stage may draw from the first frame alone, and
 //! `train.time_ramp` lets frames in one after another. With means over all cameras, those that are trained on could move together with the model, against the
 //! others, which Adam would move as fast: it divides the small gradient that a mean hands them by its own size. They have no gradient and stay at zero.
 //!
-//! Rotations are Cayley transforms: with A = \[w\]x, R = I + s (A + A A / 2) where s = 4 / (4 + |w|^2). It is a rotation for every w, by 2 atan(|w| / 2), and its
-//! derivative needs no special case at 0.
+//! Rotations are Cayley transforms: with A = \[w\]x, R = I + s (A + A A / 2) where s = 4 / (4 + |w|^2). It is a rotation for every w, by 2 atan(|w| / 2), and
+//! its derivative needs no special case at 0.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
@@ -65,8 +65,8 @@ fn rows(rotation: DMat3, translation: DVec3) -> Rows {
     std::array::from_fn(|k| if k % 4 == 3 { translation[k / 4] } else { rotation.row(k / 4)[k % 4] })
 }
 
-/// World to camera with the camera turned by the rotation vector `turn` about its centre, which moves by `shift`, both in world axes; and its derivatives by the six
-/// numbers.
+/// World to camera with the camera turned by the rotation vector `turn` about its centre, which moves by `shift`, both in world axes; and its derivatives by
+/// the six numbers.
 fn moved(camera: &Camera, turn: DVec3, shift: DVec3) -> (Rows, [Rows; 6]) {
     let (r, t) = camera.rotation_translation();
     let center = shift - r.transpose() * t;
@@ -89,7 +89,8 @@ fn is_trained(numbers: &Numbers) -> bool {
     numbers.iter().any(|v| *v != 0.0)
 }
 
-/// The factors of all cameras' numbers in the correction of camera `index`: 1 for its own, minus 1/n for each of the n cameras that were trained on, it included.
+/// The factors of all cameras' numbers in the correction of camera `index`: 1 for its own, minus 1/n for each of the n cameras that were trained on, it
+/// included.
 fn factors(all: &[Numbers], index: usize) -> Vec<f64> {
     let counts: Vec<bool> = all.iter().enumerate().map(|(i, numbers)| i == index || is_trained(numbers)).collect();
     let count = counts.iter().filter(|counts| **counts).count() as f64;
@@ -228,7 +229,8 @@ mod tests {
     use super::*;
     use cc4dgs_core::Seed;
 
-    /// Gradients of rotations and centres of four cameras, three numbers each, where camera `index` is trained on and every camera has one of `numbers` six times.
+    /// Gradients of rotations and centres of four cameras, three numbers each, where camera `index` is trained on and every camera has one of `numbers` six
+    /// times.
     fn gradients(numbers: [f32; 4], index: usize) -> [Vec<f32>; 2] {
         let device = Device::flex().autodiff();
         let context = PosesContext { cameras: 4, extent: 2.0, seed: Seed::root(1) };

@@ -48,8 +48,8 @@ fn embedding_takes_1_17_megabytes() {
     assert_eq!((grid, net), (4 * 150 * 256, 4 * (292_756 - 30 - 150 * 256)));
 }
 
-/// The floats that native-4d adds to a Gaussian's 59: a time, a duration, a velocity and two more cosines of 48. The published code has 161 in total, because it
-/// stores a rotation in four dimensions as two quaternions: eight floats, two of them norms. A quaternion and a velocity represent the same with seven.
+/// The floats that native-4d adds to a Gaussian's 59: a time, a duration, a velocity and two more cosines of 48. The published code has 161 in total, because
+/// it stores a rotation in four dimensions as two quaternions: eight floats, two of them norms. A quaternion and a velocity represent the same with seven.
 #[test]
 fn native_4d_takes_160_floats_per_gaussian() {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };

@@ -39,9 +39,9 @@ struct Done {
 /// By what the control does, the latest training last.
 static DONE: Mutex<Vec<(String, Arc<Done>)>> = Mutex::new(Vec::new());
 
-/// Does harm after every iteration: `does = "remove"` keeps a single Gaussian, `"reset"` makes all nearly transparent, `"children"` adds copies and removes those of
-/// the iteration before, `"dazzle"` makes all far too bright in the last tenth of the main stage, which no guard prevents. The default does nothing, because
-/// other tests run every registered control.
+/// Does harm after every iteration: `does = "remove"` keeps a single Gaussian, `"reset"` makes all nearly transparent, `"children"` adds copies and removes
+/// those of the iteration before, `"dazzle"` makes all far too bright in the last tenth of the main stage, which no guard prevents. The default does nothing,
+/// because other tests run every registered control.
 struct Hostile {
     does: String,
     done: Option<Arc<Done>>,
@@ -186,7 +186,8 @@ fn run(does: &str, iterations: usize) -> Run {
     run
 }
 
-/// PSNR in dB that any hostile control leaves at this size: removing whatever may go gives 18.5 dB in 300 iterations. The mean colour of the images has 15.5 dB.
+/// PSNR in dB that any hostile control leaves at this size: removing whatever may go gives 18.5 dB in 300 iterations. The mean colour of the images has 15.5
+/// dB.
 const FLOOR_DB: f64 = 17.3;
 
 #[test]

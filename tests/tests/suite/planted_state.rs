@@ -1,5 +1,5 @@
-//! Errors with state that conformance suites must find: deformers that remember their last input or mix Gaussians, density controls that count on making all plans,
-//! and an optimizer in which new rows keep the momentum of others.
+//! Errors with state that conformance suites must find: deformers that remember their last input or mix Gaussians, density controls that count on making all
+//! plans, and an optimizer in which new rows keep the momentum of others.
 
 use super::planted::NoSettings;
 use burn::tensor::{Device, Tensor};

@@ -200,9 +200,9 @@ fn needles(length: f64) -> (HostGaussians, Camera) {
 
 #[test]
 fn needles_of_thousands_of_pixels_agree_with_the_reference() {
-    // Simulated in float32 (numpy): with the exponent as a dx^2 + b dx dy + c dy^2, whose terms cancel, alpha is off by up to 4.3 levels of 255 for 1,000 pixels
-    // and by 127 for 3,000; gradients, from moments about the centres, are off by 1.1 to 2 % (7 to 22 % for 3,000). With the exponent as a sum of squares and moments
-    // about a point of the tile, alpha is off by 0.02 levels and gradients by less than 2e-4.
+    // Simulated in float32 (numpy): with the exponent as a dx^2 + b dx dy + c dy^2, whose terms cancel, alpha is off by up to 4.3 levels of 255 for 1,000
+    // pixels and by 127 for 3,000; gradients, from moments about the centres, are off by 1.1 to 2 % (7 to 22 % for 3,000). With the exponent as a sum of
+    // squares and moments about a point of the tile, alpha is off by 0.02 levels and gradients by less than 2e-4.
     for length in [1000.0, 3000.0] {
         let (host, camera) = needles(length);
         let settings = RenderSettings::default();

@@ -48,7 +48,8 @@ inventory::submit! {
     }
 }
 
-/// No density control, but in the last iteration of the main stage the first Gaussian is broken if `breaks` says so, and all get a large score if `moves_all` does.
+/// No density control, but in the last iteration of the main stage the first Gaussian is broken if `breaks` says so, and all get a large score if `moves_all`
+/// does.
 #[derive(Default, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct BreakOne {

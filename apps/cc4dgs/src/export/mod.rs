@@ -100,8 +100,9 @@ impl ExportJob<'_> {
     /// Writes the file or folder; it appears complete or not at all.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for unknown formats, settings and times, for an axis whose length is not 1, for a time where the format holds all of them, for images of several sizes where the format holds one, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
-    /// cannot hold; what device and disk report.
+    /// [`Error::Parameter`] for unknown formats, settings and times, for an axis whose length is not 1, for a time where the format holds all of them, for
+    /// images of several sizes where the format holds one, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format cannot hold;
+    /// what device and disk report.
     pub fn run(&self) -> Result<ExportReport> {
         let plugin = self.registry.exporter(self.format)?;
         let exporter = (plugin.build)(self.settings)?;

@@ -1,11 +1,11 @@
 //! Numerical stress: float32 kernels against float64 over conditions that break floating point.
 //!
 //! Each condition is tried at one or more levels (an offset of 1e2, 1e3, … units). A result *behaves* if every number is finite, or if the call returns an
-//! error; it must not panic. Some cases of every part are ordinary (*required*): there an error does not behave, so that a device that fails at everything fails
-//! this test. Where a float64 oracle exists, the error is the 95th percentile of the absolute differences over the largest absolute value of the
-//! oracle, so that a pixel at which a comparison fell the other way does not hide the digits of the others; the share of values that differ by more than 1 % is
-//! stated beside it. The *limit* of a condition is the first level at which the error is over 1 %. An error never fails a case: that float32 cannot hold
-//! coordinates of 1e6 (`moved scene …`) is a limit to know, not a defect of the device.
+//! error; it must not panic. Some cases of every part are ordinary (*required*): there an error does not behave, so that a device that fails at everything
+//! fails this test. Where a float64 oracle exists, the error is the 95th percentile of the absolute differences over the largest absolute value of the oracle,
+//! so that a pixel at which a comparison fell the other way does not hide the digits of the others; the share of values that differ by more than 1 % is stated
+//! beside it. The *limit* of a condition is the first level at which the error is over 1 %. An error never fails a case: that float32 cannot hold coordinates
+//! of 1e6 (`moved scene …`) is a limit to know, not a defect of the device.
 
 mod exact;
 mod raster;
@@ -51,8 +51,8 @@ pub struct StressCase {
     pub condition: String,
     /// Its level.
     pub level: String,
-    /// What it was compared with: `float64`, `float32 on the host` for parts of other devices without an oracle of their own, [`NO_ORACLE`] where there is none;
-    /// absent where there were no values.
+    /// What it was compared with: `float64`, `float32 on the host` for parts of other devices without an oracle of their own, [`NO_ORACLE`] where there is
+    /// none; absent where there were no values.
     pub oracle: Option<String>,
     /// 95th percentile of the error, relative to the oracle's largest value; absent without an oracle or without numbers.
     pub error: Option<f64>,

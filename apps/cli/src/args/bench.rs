@@ -146,7 +146,8 @@ pub struct BenchFrame {
     /// Let the deformer move things, by about so many units at most; fresh deformers are the identity.
     #[arg(long, value_name = "UNITS", default_value_t = 0.0, value_parser = not_negative)]
     pub motion: f32,
-    /// Also store the model of the case with a playback layer and its camera, for players; there must be one case. An archive F.cc4d is replaced, no other file.
+    /// Also store the model of the case with a playback layer and its camera, for players; there must be one case. An archive F.cc4d is replaced, no other
+    /// file.
     #[arg(long, value_name = "F.cc4d")]
     pub archive: Option<PathBuf>,
     /// Settings of the deformer or rasterizer, such as deformer.kind=none; may be given several times.

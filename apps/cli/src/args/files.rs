@@ -60,7 +60,8 @@ pub struct Shots {
     /// Which side of the dataset's split; with --scene only [default: test].
     #[arg(long, value_enum, requires = "scene")]
     pub split: Option<SplitArg>,
-    /// Number of frames: of the orbit (60 by default); at most so many of the dataset, spread over cameras and frames (all by default); of ply-sequence (those of training by default).
+    /// Number of frames: of the orbit (60 by default); at most so many of the dataset, spread over cameras and frames (all by default); of ply-sequence (those
+    /// of training by default).
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
     /// Image size in pixels; by default 800x600 for an orbit, for datasets their own.

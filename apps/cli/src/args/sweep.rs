@@ -18,7 +18,8 @@ pub enum SweepWhat {
     Run(SweepRun),
     /// Check that every cell is there, and write the tables.
     Collect(SweepCollect),
-    /// Print a job file for a scheduler: each index runs one training with its cells, on --threads threads (one by default) and with the --limit options given here.
+    /// Print a job file for a scheduler: each index runs one training with its cells, on --threads threads (one by default) and with the --limit options given
+    /// here.
     Emit(SweepEmit),
 }
 
@@ -128,8 +129,8 @@ pub struct SweepEmit {
     /// Bucket; skypilot only [default: s3://cc4dgs].
     #[arg(long, value_name = "URL")]
     pub bucket: Option<String>,
-    /// Environment variable of the jobs; may be given several times. k8s and skypilot need those that paths of scenes start from, such as CC4DGS_DATA; slurm takes
-    /// their values here where they are not given.
+    /// Environment variable of the jobs; may be given several times. k8s and skypilot need those that paths of scenes start from, such as CC4DGS_DATA; slurm
+    /// takes their values here where they are not given.
     #[arg(long = "env", value_name = "NAME=VALUE")]
     pub variables: Vec<String>,
 }

@@ -106,8 +106,8 @@ fn default_sheet(model: &Path, split: Split, json_file: Option<&Path>) -> PathBu
     }
 }
 
-/// Refuses to replace a file that is no PNG image by a contact sheet, and a file in the folder of the scene, which may be one of its images. A sheet that cannot be
-/// written is refused, too: the numbers would be measured first.
+/// Refuses to replace a file that is no PNG image by a contact sheet, and a file in the folder of the scene, which may be one of its images. A sheet that
+/// cannot be written is refused, too: the numbers would be measured first.
 fn check_sheet(sheet: &Path, scene: &Path, overwrite: bool) -> Result<()> {
     refuse_other_content(sheet, "a PNG image", |head| head.starts_with(PNG))?;
     if !overwrite && lies_in(sheet, scene) {
@@ -120,8 +120,8 @@ fn check_sheet(sheet: &Path, scene: &Path, overwrite: bool) -> Result<()> {
     })
 }
 
-/// The renders that an earlier command left in `folder`. A folder that holds anything is refused without `overwrite`; with it, one that holds anything else, and
-/// one that no command marked, whose images may be those of a dataset.
+/// The renders that an earlier command left in `folder`. A folder that holds anything is refused without `overwrite`; with it, one that holds anything else,
+/// and one that no command marked, whose images may be those of a dataset.
 fn earlier_renders(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
     let refuse = |problem: String, remedy: &str| Err(Error::parameter("--renders", problem, remedy));
     let entries = image_folder::entries(folder)?;

@@ -67,8 +67,8 @@ impl Context<'_> {
 /// Stack of a thread in bytes: commands run on the pool's threads, so it is that of a main thread.
 const STACK: usize = 8 << 20;
 
-/// Runs the command that was asked for, on a thread of the pool: an operation in parallel then starts at once. From outside, each of the thousands of a training
-/// step would wake the pool's threads and wait for them.
+/// Runs the command that was asked for, on a thread of the pool: an operation in parallel then starts at once. From outside, each of the thousands of a
+/// training step would wake the pool's threads and wait for them.
 pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
     // Where the pool already runs (a program calling `run` twice), it stays as it is: results do not depend on it.
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads).stack_size(STACK).build_global().ok();
@@ -154,8 +154,8 @@ fn no_window(command: String) -> Error {
     Error::unsupported(command, "the window is left out of this build", remedy)
 }
 
-/// Refuses a file `path` that exists, unless it may be replaced, that of a folder, and one that cannot be written, before any long work that would be lost. Nothing
-/// is created.
+/// Refuses a file `path` that exists, unless it may be replaced, that of a folder, and one that cannot be written, before any long work that would be lost.
+/// Nothing is created.
 ///
 /// # Errors
 /// Those of [`refuse_existing`] and of [`check_writable`].

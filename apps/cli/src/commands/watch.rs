@@ -67,8 +67,8 @@ fn content(snapshot: Snapshot) -> Result<Content> {
     Content::of_model(StoredModel { manifest, gaussians, moving: Moving::Nothing, playback }, 0)
 }
 
-/// Trains on a thread of its own while the window has this one, the main thread. The training goes on where the window is closed; the window stays open where the
-/// training ends.
+/// Trains on a thread of its own while the window has this one, the main thread. The training goes on where the window is closed; the window stays open where
+/// the training ends.
 pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> Result<()> + Send)) -> Result<()> + Send) -> Result<()> {
     let stop = interrupt::stop_flag()?;
     let (live, now) = (Arc::new(Live::default()), Instant::now());

@@ -32,13 +32,14 @@ impl Navigator {
         (pose[6], pose[8]) = ((2.0 * down.atan()).clamp(*POSE_FOV.start(), *POSE_FOV.end()), across / down);
         pose
     }
-    /// The pose of seven to nine numbers, `None` for another number of them. Without the eighth there is no roll; without the ninth, as in older links, the aspect
-    /// is that of the first view.
+    /// The pose of seven to nine numbers, `None` for another number of them. Without the eighth there is no roll; without the ninth, as in older links, the
+    /// aspect is that of the first view.
     pub fn pose_of(numbers: &[f64]) -> Option<Pose> {
         (7..=9).contains(&numbers.len()).then(|| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(0.0)))
     }
-    /// `pose` as links and commands have it: numbers with commas between, without zeros for roll and aspect at the end. Positions are right to a millionth of the
-    /// distance between eye and target, however far from the origin they are, or of views narrower than 0.01 to a ten-thousandth of what is seen at the target.
+    /// `pose` as links and commands have it: numbers with commas between, without zeros for roll and aspect at the end. Positions are right to a millionth of
+    /// the distance between eye and target, however far from the origin they are, or of views narrower than 0.01 to a ten-thousandth of what is seen at the
+    /// target.
     pub fn pose_text(pose: Pose) -> String {
         let distance = (0..3).map(|axis| (pose[axis] - pose[axis + 3]).powi(2)).sum::<f64>().sqrt();
         let decimals = |size: f64, least: f64| (6.0 - size.log10().floor()).clamp(least, 17.0) as usize;

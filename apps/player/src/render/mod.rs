@@ -123,8 +123,8 @@ impl Renderer {
         let limits = self.device.limits();
         MostPixels::new(limits.max_texture_dimension_2d, limits.max_buffer_size)
     }
-    /// Encodes a frame into `out`, a texture view of the renderer's format and of any size; the image is scaled to it. Cameras of larger images than the textures of
-    /// the device are drawn with as many pixels as fit, in the same shape. Nothing is waited for.
+    /// Encodes a frame into `out`, a texture view of the renderer's format and of any size; the image is scaled to it. Cameras of larger images than the
+    /// textures of the device are drawn with as many pixels as fit, in the same shape. Nothing is waited for.
     pub fn draw(&mut self, view: &View, out: &wgpu::TextureView) {
         let wanted = (view.camera.width, view.camera.height);
         let (width, height) = MostPixels { all: u64::MAX, ..self.most_pixels() }.fit(wanted);
@@ -155,7 +155,8 @@ impl Renderer {
         target.present(&mut encoder, &self.pipelines, out);
         self.queue.submit([encoder.finish()]);
     }
-    /// Draws a frame and starts to copy it to host memory; `done` receives the 8-bit RGB image. In a browser that happens later, elsewhere when the device is polled.
+    /// Draws a frame and starts to copy it to host memory; `done` receives the 8-bit RGB image. In a browser that happens later, elsewhere when the device is
+    /// polled.
     pub fn capture(&mut self, view: &View, done: impl FnOnce(Result<Image8>) + wgpu::WasmNotSend + 'static) {
         let (width, height) = (view.camera.width.max(1), view.camera.height.max(1));
         let limits = self.device.limits();

@@ -23,8 +23,8 @@ impl MostPixels {
         let (side, copied) = (side.max(1), buffer_bytes / 4);
         Self { side, all: copied.saturating_sub(ROW_PIXELS * u64::from(side)).clamp(1, MOST_PIXELS) }
     }
-    /// The largest size that fits, of the shape of `wanted` (columns and rows): both sides are scaled alike, and rounded down to whole pixels. What fits is returned
-    /// as it is. No side is 0.
+    /// The largest size that fits, of the shape of `wanted` (columns and rows): both sides are scaled alike, and rounded down to whole pixels. What fits is
+    /// returned as it is. No side is 0.
     pub(crate) fn fit(self, wanted: (u32, u32)) -> (u32, u32) {
         let (width, height) = (wanted.0.max(1), wanted.1.max(1));
         let (w, h) = (f64::from(width), f64::from(height));

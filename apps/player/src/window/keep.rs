@@ -37,7 +37,8 @@ impl Window {
         let start = Start { time: Some(self.clock.time), pose: Some(self.navigator.pose_shown(self.drawn.0, self.drawn.1)) };
         self.source.as_ref().map(|source| start.command(&source.command, &source.path))
     }
-    /// Writes the command that opens this file at this time and pose to standard output, and shows it. Clipboards need a library per window system, which is not here.
+    /// Writes the command that opens this file at this time and pose to standard output, and shows it. Clipboards need a library per window system, which is
+    /// not here.
     pub(super) fn print_command(&mut self) {
         if let Some(command) = self.command() {
             // Nobody reads it where standard output is closed; the window shows it, too.

@@ -59,7 +59,8 @@ const COPIES: &str = "A training hands over copies of its Gaussians, without its
 /// Opens a window until it is closed. Call it on the main thread: some systems allow windows there only.
 ///
 /// # Errors
-/// [`Error::Limit`] for models that the device has no memory for, [`Error::Unsupported`] where no window can be opened, [`Error::Backend`] where the device is lost.
+/// [`Error::Limit`] for models that the device has no memory for, [`Error::Unsupported`] where no window can be opened, [`Error::Backend`] where the device is
+/// lost.
 pub fn show(title: &str, shown: Shown) -> Result<()> {
     let lost = Lost::default();
     let of_window = lost.clone();

@@ -74,8 +74,8 @@ pub fn alphas<S: Simd>(simd: S, splat: &ScreenSplat, dx: Lanes<S>, centers: &[f3
     }
 }
 
-/// Blends every tile into `planes` `[5,H,W]`, of which every element is written, and saves what the backward pass needs. Returns the number of (Gaussian, pixel)
-/// evaluations.
+/// Blends every tile into `planes` `[5,H,W]`, of which every element is written, and saves what the backward pass needs. Returns the number of (Gaussian,
+/// pixel) evaluations.
 pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [MaybeUninit<f32>]) -> u64 {
     let tiles_x = settings.width.div_ceil(TILE);
     let tiles = tiles_x * settings.height.div_ceil(TILE);

@@ -1,10 +1,10 @@
 //! Back-to-front derivative of blending, one tile at a time.
 //!
 //! With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i the part of the loss behind it,
-//! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = -d loss / d
-//! sigma times powers of u and t (sigma = u^2 + t^2). Along a column these are linear in the row y, so powers of y are added up over the rows, and turned into
-//! those of u and t once. y is the offset from the point of the column that is next to the Gaussian's centre: squares of thousands of pixels would leave nothing of the
-//! digits of v.
+//! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = -d loss / d sigma times powers
+//! of u and t (sigma = u^2 + t^2). Along a column these are linear in the row y, so powers of y are added up over the rows, and turned into those of u and t
+//! once. y is the offset from the point of the column that is next to the Gaussian's centre: squares of thousands of pixels would leave nothing of the digits
+//! of v.
 
 use super::blend::{AHEAD, Gap, TOGETHER, TilePlane, alphas, column_centers, row_centers};
 use super::camera::{ALPHA_MIN, RuleConstants};
@@ -14,8 +14,8 @@ use super::{AT_DEPTH, RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
 use crate::cpu::simd::{Lanes, dispatch, each, prefetch, vectorized};
 use pulp::{Simd, WithSimd};
 
-/// Per column: sums of v times u, t, u^2, u t and t^2 with sigma = u^2 + t^2, from `sums` of v times 1, y and y^2. `dx` is that of the column from the Gaussian's
-/// centre, `offset` where y = 0 from it.
+/// Per column: sums of v times u, t, u^2, u t and t^2 with sigma = u^2 + t^2, from `sums` of v times 1, y and y^2. `dx` is that of the column from the
+/// Gaussian's centre, `offset` where y = 0 from it.
 #[inline(always)]
 fn moments<S: Simd>([l1, l2, l3]: [Lanes<S>; 3], dx: Lanes<S>, offset: Lanes<S>, [v, v_y, v_y2]: [Lanes<S>; 3]) -> [Lanes<S>; 5] {
     // u and t where y = 0.

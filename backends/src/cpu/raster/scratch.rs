@@ -105,8 +105,8 @@ pub struct Buffers {
     pub final_transmittance: Vec<f32>,
     /// Position in the list where the pixel stopped, per tile and pixel.
     pub stop_at: Vec<u32>,
-    /// By index in `list`: sums over the pixels of a tile of v = -d loss / d sigma times u, t, u^2, u t, t^2 and 1, where sigma = u^2 + t^2, and of the blending
-    /// weight times the gradient of the colours and of the depth.
+    /// By index in `list`: sums over the pixels of a tile of v = -d loss / d sigma times u, t, u^2, u t, t^2 and 1, where sigma = u^2 + t^2, and of the
+    /// blending weight times the gradient of the colours and of the depth.
     pub records: Vec<[f32; RECORD]>,
     /// Sums of absolute gradients of the centre (x, y) by index in `list`, when asked for.
     pub absolute: Vec<[f32; 2]>,

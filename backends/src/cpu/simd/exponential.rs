@@ -18,8 +18,8 @@ const EXP2_5: [f32; 5] = [0.693_147, 0.240_222_42, 0.055_507_337, 0.009_671_513,
 const EXP2_6: [f32; 6] = [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_325, 0.009_618_437, 0.001_339_887_4, 0.000_153_533_6];
 
 impl<S: Simd> Lanes<S> {
-    /// exp(-x) of each of `x` for 0 <= x <= 87; relative error under 2e-7 where the result is over 1/255, exactly 1 at 0, garbage outside the range. Every step is
-    /// taken for all of them before the next one: a processor does not look far enough ahead to find out that they do not depend on each other.
+    /// exp(-x) of each of `x` for 0 <= x <= 87; relative error under 2e-7 where the result is over 1/255, exactly 1 at 0, garbage outside the range. Every step
+    /// is taken for all of them before the next one: a processor does not look far enough ahead to find out that they do not depend on each other.
     #[inline(always)]
     pub fn exp_negated<const N: usize>(x: [Self; N]) -> [Self; N] {
         let like = |v: f32| x[0].like(v);

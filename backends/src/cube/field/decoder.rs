@@ -30,8 +30,8 @@ fn product(a: u32, x: u32) -> u32 {
     fold(fold(((high & 0x7fffu32) << 16) + (high >> 15)) + low)
 }
 
-/// Entry `k` of the signature of a vertex of `vertices` `[U,3]`: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows `[k]` each,
-/// then b `[k]`.
+/// Entry `k` of the signature of a vertex of `vertices` `[U,3]`: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows `[k]`
+/// each, then b `[k]`.
 #[cube]
 pub fn signature(vertices: &[i32], constants: &[u32], at: usize, vertex: usize, k: usize, hashes: usize, modulus: u32, scale: f32) -> f32 {
     let mut sum = constants[at + 3 * hashes + k];

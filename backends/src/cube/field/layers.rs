@@ -1,5 +1,5 @@
-//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W `[in, out]` row-major and then b `[out]`, at
-//! an offset. A thread computes one column of several rows, so that a weight is read once for all of them.
+//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W `[in, out]` row-major and then b
+//! `[out]`, at an offset. A thread computes one column of several rows, so that a weight is read once for all of them.
 
 use super::activation::relu_is_zero;
 use crate::cube::tensor::{THREADS, floats, workgroups_for};

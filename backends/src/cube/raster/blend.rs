@@ -163,8 +163,8 @@ pub const fn record_floats(absolute: bool) -> usize {
     if absolute { RECORD + 2 } else { RECORD }
 }
 
-/// Gradient records of all pairs, [`record_floats`] each, which [`super::gradient::sum_records`] turns into gradients. With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i
-/// the part of the loss that lies behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
+/// Gradient records of all pairs, [`record_floats`] each, which [`super::gradient::sum_records`] turns into gradients. With q_i the upstream gradient of what
+/// Gaussian i shows at a pixel and S_i the part of the loss that lies behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
 #[cube(launch_unchecked)]
 pub fn blend_tiles_backward(
     splats: &[f32],

@@ -28,8 +28,8 @@ fn refuse(like: &CubeTensor, refusal: Refusal) -> Rasterized<CubeBackend> {
     }
 }
 
-/// Upper bound on the Gaussians: the widest array that is bound as a whole has at most `binding` bytes, and the coefficients above degree 0, `rest_width` floats per
-/// Gaussian, which are bound in blocks of rows, at most the `buffer` bytes of one allocation.
+/// Upper bound on the Gaussians: the widest array that is bound as a whole has at most `binding` bytes, and the coefficients above degree 0, `rest_width`
+/// floats per Gaussian, which are bound in blocks of rows, at most the `buffer` bytes of one allocation.
 fn most_gaussians(binding: u64, buffer: u64, rest_width: usize) -> u64 {
     let widest = KEYS.max(RECORD).max(SCREEN).max(GEOMETRY) as u64;
     (binding / (4 * widest)).min(buffer / (4 * rest_width.max(1) as u64))

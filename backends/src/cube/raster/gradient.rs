@@ -100,8 +100,8 @@ pub fn sum_absolute(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], ou
     }
 }
 
-/// Gradients of the degree-0 coefficients (or colours) `[N,3]` and of the higher ones `[N,K,3]`, for `count` Gaussians from `first` on, whose higher coefficients
-/// `sh_rest` and `d_rest` hold; that of the offset goes to the screen gradients.
+/// Gradients of the degree-0 coefficients (or colours) `[N,3]` and of the higher ones `[N,K,3]`, for `count` Gaussians from `first` on, whose higher
+/// coefficients `sh_rest` and `d_rest` hold; that of the offset goes to the screen gradients.
 #[cube(launch)]
 pub fn color_backward(
     means: &[f32],
@@ -259,8 +259,8 @@ pub fn sum_rows(from: &[f32], to: &mut [f32], rows: u32, stride: u32, first: u32
     }
 }
 
-/// Gradient of the camera matrix `[4,4]`, row-major, as `CameraSums::matrix_gradient` finds it: from the sums of the gradients of rotation and translation `[12]`
-/// and of the offsets from the camera `[3]`, and the inverse of the matrix `[4,4]`.
+/// Gradient of the camera matrix `[4,4]`, row-major, as `CameraSums::matrix_gradient` finds it: from the sums of the gradients of rotation and translation
+/// `[12]` and of the offsets from the camera `[3]`, and the inverse of the matrix `[4,4]`.
 #[cube(launch)]
 pub fn camera_matrix(of_camera: &[f32], of_offset: &[f32], inverse: &[f32], out: &mut [f32]) {
     if ABSOLUTE_POS < out.len() {

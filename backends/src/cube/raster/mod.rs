@@ -1,8 +1,8 @@
 //! The tile rasterizer on the device.
 //!
-//! Gaussians are projected, sorted by depth, and appended to the lists of the tiles they meet in that order; a stable sort of the pairs by tile alone then keeps
-//! every list in depth order. The number of pairs is the one thing read back per render, unless the caller states a capacity. Backwards,
-//! each pair has a gradient record of its own, and the pairs of a Gaussian are adjacent, so that all sums have a fixed order.
+//! Gaussians are projected, sorted by depth, and appended to the lists of the tiles they meet in that order; a stable sort of the pairs by tile alone then
+//! keeps every list in depth order. The number of pairs is the one thing read back per render, unless the caller states a capacity. Backwards, each pair has a
+//! gradient record of its own, and the pairs of a Gaussian are adjacent, so that all sums have a fixed order.
 
 mod backward;
 mod blend;

@@ -72,8 +72,8 @@ pub struct RasterSettings {
     pub shortcuts: Shortcuts,
 }
 
-/// Shortcuts of the tile rasterizer on processors. They change no bit of images and of the Gaussians' gradients (the order in which the gradient of the camera's
-/// pose is summed may change); they are switched off only to measure what they save. Kernels for GPUs always take both, and refuse other settings.
+/// Shortcuts of the tile rasterizer on processors. They change no bit of images and of the Gaussians' gradients (the order in which the gradient of the
+/// camera's pose is summed may change); they are switched off only to measure what they save. Kernels for GPUs always take both, and refuse other settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shortcuts {
     /// Footprints end where alpha falls below 1/255, rather than at 3.33 sigma.

@@ -104,8 +104,8 @@ impl Archive {
     pub fn from_bytes(object: impl Into<String>, bytes: Vec<u8>, limits: &Limits) -> Result<Self> {
         Self::from_source(object.into(), Source::Memory(bytes), limits)
     }
-    /// Bytes from the start of a file to the end of its header, from its first [`Archive::PREFIX_BYTES`]; `object` names it in errors. With them,
-    /// and `total` bytes altogether, [`Archive::from_bytes`] reads the manifest and the directory; streams that are missing fail their checksum when they are read.
+    /// Bytes from the start of a file to the end of its header, from its first [`Archive::PREFIX_BYTES`]; `object` names it in errors. With them, and `total`
+    /// bytes altogether, [`Archive::from_bytes`] reads the manifest and the directory; streams that are missing fail their checksum when they are read.
     ///
     /// # Errors
     /// [`Error::Data`] for a file that is no archive, [`Error::Limit`].

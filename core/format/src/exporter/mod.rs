@@ -97,9 +97,9 @@ pub trait ExportSource {
     /// # Errors
     /// What the renderer reports; [`Error::Unsupported`](crate::Error::Unsupported) where there is none.
     fn image(&mut self, index: usize) -> Result<Image8>;
-    /// The model as the bytes of an archive that players without burn play, in the coordinates of the model: with the deformer's weights where its motion can be
-    /// computed from them ([`PlaybackLayer::computed`](crate::playback::PlaybackLayer::computed)) and `baked` does not ask for a layer; else with a layer in which
-    /// points are off by at most `max_error`.
+    /// The model as the bytes of an archive that players without burn play, in the coordinates of the model: with the deformer's weights where its motion can
+    /// be computed from them ([`PlaybackLayer::computed`](crate::playback::PlaybackLayer::computed)) and `baked` does not ask for a layer; else with a layer in
+    /// which points are off by at most `max_error`.
     ///
     /// # Errors
     /// What baking reports; [`Error::Unsupported`](crate::Error::Unsupported) where the source cannot bake.
@@ -131,8 +131,8 @@ pub trait Exporter: Send + Sync {
     /// Writes the file `path`, or files into the existing empty folder `path`. Equal Gaussians and settings give equal bytes.
     ///
     /// # Errors
-    /// [`Error::Data`](crate::Error::Data) and [`Error::Limit`](crate::Error::Limit) for models that the format cannot hold, [`Error::Io`](crate::Error::Io), and
-    /// those of the source.
+    /// [`Error::Data`](crate::Error::Data) and [`Error::Limit`](crate::Error::Limit) for models that the format cannot hold, [`Error::Io`](crate::Error::Io),
+    /// and those of the source.
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported>;
 }
 

@@ -2,9 +2,9 @@
 //!
 //! The offsets of a Gaussian are linear in functions of time that all Gaussians share: offsets(t) = C φ(t). φ is sampled at even times over the sequence and
 //! interpolated linearly in between. Each Gaussian uses only as many of the functions as it needs, so one that drifts costs one coefficient per number, and one
-//! that dances costs more. A deformer that is linear in its functions (`cdf-basis`, `hash-basis`) is represented exactly by as many functions as it has; all others by a
-//! truncated singular value decomposition over the samples. Where motion is large, the sequence is divided into segments with functions and coefficients of their
-//! own; neighbours share the sample between them.
+//! that dances costs more. A deformer that is linear in its functions (`cdf-basis`, `hash-basis`) is represented exactly by as many functions as it has; all
+//! others by a truncated singular value decomposition over the samples. Where motion is large, the sequence is divided into segments with functions and
+//! coefficients of their own; neighbours share the sample between them.
 //!
 //! Layers of deformers that are linear can be computed from their weights when a model is opened ([`PlaybackLayer::computed`]): such files need none.
 //!

@@ -1,10 +1,10 @@
 //! The layer as bytes, and back from untrusted ones.
 //!
-//! `playback.meta`: u8 version 1, u8 degree, u16 samples, u16 segments, u32 M, then per segment u16 last sample, u8 tracks, and per track u8 head, u8 R, f32 step,
-//! R x f32 largest absolute value of each function. `playback.rows`: the gaps between ascending rows, u32 [M]. Then per segment k and head,
-//! `playback.k.HEAD.functions`: i16 [R, samples], 32767 standing for the largest value; `.ranks`: u8 [M]; `.exponents`: u8 [M] of the Gaussians of rank over
-//! 0; `.coefficients`: zigzag u32, function by function, then number by number, then Gaussian by Gaussian of a sufficient rank. A coefficient is its integer
-//! times step times 2^-exponent. All little-endian.
+//! `playback.meta`: u8 version 1, u8 degree, u16 samples, u16 segments, u32 M, then per segment u16 last sample, u8 tracks, and per track u8 head, u8 R, f32
+//! step, R x f32 largest absolute value of each function. `playback.rows`: the gaps between ascending rows, u32 [M]. Then per segment k and head,
+//! `playback.k.HEAD.functions`: i16 [R, samples], 32767 standing for the largest value; `.ranks`: u8 [M]; `.exponents`: u8 [M] of the Gaussians of rank over 0;
+//! `.coefficients`: zigzag u32, function by function, then number by number, then Gaussian by Gaussian of a sufficient rank. A coefficient is its integer times
+//! step times 2^-exponent. All little-endian.
 
 use super::checks::Checks;
 use super::layer::{Head, PlaybackLayer, Segment, Track};

@@ -43,8 +43,8 @@ pub struct SpzOptions {
     pub sh_rest_bits: u8,
     /// Whether the model wants Mip-Splatting's 2D filter.
     pub antialiased: bool,
-    /// Whether centres have 12 fractional bits, as in Niantic's own writer, where all fit and steps of 2^-12 are not coarse: some readers refuse others. Else they have
-    /// as many as fit.
+    /// Whether centres have 12 fractional bits, as in Niantic's own writer, where all fit and steps of 2^-12 are not coarse: some readers refuse others. Else
+    /// they have as many as fit.
     pub usual_fraction: bool,
 }
 
@@ -91,8 +91,8 @@ pub fn to_spz(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Vec<u8>
     if options.version == 3 { gzip::write(&packed) } else { frames::write(&packed) }
 }
 
-/// What [`to_spz`] limits or rounds coarsely, in words: values outside of the ranges of the format, and centres in steps that are large beside the Gaussians; and
-/// whether centres have other than the usual fractional bits that are asked for.
+/// What [`to_spz`] limits or rounds coarsely, in words: values outside of the ranges of the format, and centres in steps that are large beside the Gaussians;
+/// and whether centres have other than the usual fractional bits that are asked for.
 pub fn remarks(gaussians: &HostGaussians, options: &SpzOptions) -> Vec<String> {
     values::remarks(gaussians, options)
 }

@@ -63,8 +63,8 @@ fn fraction_of(gaussians: &HostGaussians, options: &SpzOptions) -> u8 {
     if usual { USUAL_FRACTION } else { most }
 }
 
-/// What a file does not hold of `gaussians`, in words: values outside of its ranges, and centres in steps that are coarse for such Gaussians; and other fractional bits
-/// of centres than readers may want.
+/// What a file does not hold of `gaussians`, in words: values outside of its ranges, and centres in steps that are coarse for such Gaussians; and other
+/// fractional bits of centres than readers may want.
 pub(super) fn remarks(gaussians: &HostGaussians, options: &SpzOptions) -> Vec<String> {
     let outside = |values: &[f32], code: fn(f32) -> f32| values.iter().filter(|v| !(0.0..=255.0).contains(&code(**v).round())).count();
     let counts = [

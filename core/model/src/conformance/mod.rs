@@ -1,7 +1,7 @@
 //! Conformance suites for plug-ins. Call them from a test of the plug-in's own crate.
 //!
-//! Each returns a list of findings, one line each; an empty list means that the plug-in passed. They generate their own inputs and need no data, except for readers,
-//! which need a tiny dataset.
+//! Each returns a list of findings, one line each; an empty list means that the plug-in passed. They generate their own inputs and need no data, except for
+//! readers, which need a tiny dataset.
 
 mod appearance;
 mod deformer;

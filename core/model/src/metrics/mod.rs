@@ -1,8 +1,7 @@
 //! Image metrics. A score depends on its protocol, so a [`Metric`] carries its [`Protocol`].
 //!
-//! Low-level functions ([`psnr`], [`ssim`], [`ms_ssim`], [`flip`], [`Lpips::distance`]) take [`Planes`] in float64; [`Metric::score`] takes float32 planes as rasterizers
-//! return them and applies the protocol (rounding, mask) first. All sums run in a fixed order, so a score does not depend
-//! on the number of threads.
+//! Low-level functions ([`psnr`], [`ssim`], [`ms_ssim`], [`flip`], [`Lpips::distance`]) take [`Planes`] in float64; [`Metric::score`] takes float32 planes as
+//! rasterizers return them and applies the protocol (rounding, mask) first. All sums run in a fixed order, so a score does not depend on the number of threads.
 
 mod flip;
 #[cfg(test)]

@@ -160,10 +160,12 @@ impl Metric {
     pub fn protocol(&self) -> &Protocol {
         &self.protocol
     }
-    /// The score of `render` against `reference`, both planes `[channels, height, width]` in 0..1. A masked metric needs a mask `[H,W]`, others must not get one.
+    /// The score of `render` against `reference`, both planes `[channels, height, width]` in 0..1. A masked metric needs a mask `[H,W]`, others must not get
+    /// one.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for shapes and masks that do not match, [`Error::Data`] for values that are not finite, [`Error::Unsupported`] for MS-SSIM with a mask.
+    /// [`Error::Parameter`] for shapes and masks that do not match, [`Error::Data`] for values that are not finite, [`Error::Unsupported`] for MS-SSIM with a
+    /// mask.
     pub fn score(&self, reference: &[f32], render: &[f32], shape: [usize; 3], mask: Option<&[bool]>) -> Result<f64> {
         let [channels, height, width] = shape;
         let planes = |values: &[f32]| match self.protocol.rounding {

@@ -105,8 +105,8 @@ fn image_error(path: &Path, e: impl std::fmt::Display) -> Error {
     Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Fetch the file again, or remove it from the dataset")
 }
 
-/// The error of an image that is not decoded. Fetching a file of another format again does not help. Formats of which not even the first bytes are known, such as
-/// HEIC, are told by the file's extension.
+/// The error of an image that is not decoded. Fetching a file of another format again does not help. Formats of which not even the first bytes are known, such
+/// as HEIC, are told by the file's extension.
 fn not_decoded(path: &Path, e: ImageError) -> Error {
     let is_other = |hint: ImageFormatHint| matches!(hint, ImageFormatHint::Exact(_)) || !has_extension(path, &["png", "jpg", "jpeg"]);
     match &e {

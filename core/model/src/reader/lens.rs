@@ -35,8 +35,8 @@ pub enum Distortion {
         /// sx1, sy1.
         prism: [f64; 2],
     },
-    /// COLMAP's `RAD_TAN_THIN_PRISM_FISHEYE` (Fisheye624 of Project Aria): a longer polynomial in the angle, and tangential and thin-prism terms of the point that it
-    /// scaled.
+    /// COLMAP's `RAD_TAN_THIN_PRISM_FISHEYE` (Fisheye624 of Project Aria): a longer polynomial in the angle, and tangential and thin-prism terms of the point
+    /// that it scaled.
     RadTanThinPrismFisheye {
         /// k0..k5.
         radial: [f64; 6],
@@ -55,7 +55,8 @@ pub enum Distortion {
         /// k; negative for barrel distortion.
         k: f64,
     },
-    /// COLMAP's `EUCM`, the enhanced unified camera model (Khomutenko, Garcia and Martinet 2016): the undistorted point over alpha sqrt(beta r^2 + 1) + 1 - alpha.
+    /// COLMAP's `EUCM`, the enhanced unified camera model (Khomutenko, Garcia and Martinet 2016): the undistorted point over
+    /// alpha sqrt(beta r^2 + 1) + 1 - alpha.
     EnhancedUnified {
         /// From 0, no distortion, to 1.
         alpha: f64,

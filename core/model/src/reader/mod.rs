@@ -1,7 +1,7 @@
 //! Readers: dataset formats as plug-ins.
 //!
-//! A reader parses the index files of a dataset into a [`RawScene`]: calibrated cameras, views, and where the image of each view comes from. Everything
-//! common to all scenes (choosing frames and cameras, resizing, undoing lens distortion, the frame cache) happens afterwards, in the same code for every reader.
+//! A reader parses the index files of a dataset into a [`RawScene`]: calibrated cameras, views, and where the image of each view comes from. Everything common
+//! to all scenes (choosing frames and cameras, resizing, undoing lens distortion, the frame cache) happens afterwards, in the same code for every reader.
 //!
 //! ```
 //! use cc4dgs_core::reader::{RawScene, ReaderPlugin, SceneOptions, files};
@@ -54,7 +54,8 @@ pub struct ReaderPlugin {
     /// Parses the index files at a path. No image is decoded. The path need not exist for a reader that computes its scenes.
     ///
     /// # Errors
-    /// [`crate::Error::Data`] for invalid files, [`crate::Error::Limit`] for sizes over the limits, [`crate::Error::Parameter`] for options that it does not support.
+    /// [`crate::Error::Data`] for invalid files, [`crate::Error::Limit`] for sizes over the limits, [`crate::Error::Parameter`] for options that it does not
+    /// support.
     pub open: fn(&Path, &SceneOptions, &Limits) -> Result<RawScene>,
 }
 

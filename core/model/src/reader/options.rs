@@ -83,8 +83,8 @@ pub struct SceneOptions {
     pub test_cameras: Option<Vec<CameraRef>>,
     /// At most this many training views, evenly spread; 0 for all.
     pub max_views: usize,
-    /// Which `transforms_*.json` is the held-out one of Blender-style scenes (`val` is the usual choice for D-NeRF lego). Otherwise views of `transforms_val.json` are
-    /// validation views.
+    /// Which `transforms_*.json` is the held-out one of Blender-style scenes (`val` is the usual choice for D-NeRF lego). Otherwise views of
+    /// `transforms_val.json` are validation views.
     pub test_split: String,
     /// The `ffmpeg` command for video input; `ffprobe` is expected in the same folder.
     pub ffmpeg: String,

@@ -4,8 +4,8 @@ use super::motion::offsets_of;
 use cc4dgs_core::playback::{Head, MAX_FUNCTIONS, PlaybackLayer, Segment, Track};
 use cc4dgs_core::{Error, HostGaussians, Result};
 
-/// The layer that interpolates linearly between `moved`, the Gaussians `rows` of `canonical` at even times from 0 to 1. It is exact at these times. Its functions
-/// are one hat per keyframe, so its size grows with their number; [`bake`](super::bake) makes small layers.
+/// The layer that interpolates linearly between `moved`, the Gaussians `rows` of `canonical` at even times from 0 to 1. It is exact at these times. Its
+/// functions are one hat per keyframe, so its size grows with their number; [`bake`](super::bake) makes small layers.
 ///
 /// # Errors
 /// [`Error::Parameter`] for fewer than 2 or more than [`MAX_FUNCTIONS`] keyframes, for keyframes of another number of Gaussians, and for rows that are not

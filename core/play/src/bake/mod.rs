@@ -1,8 +1,8 @@
 //! Baking: the motion of a model's deformer as a playback layer (`cc4dgs_core::playback`).
 //!
 //! The deformer is evaluated at even times, and its results, as the rasterizer would receive them, are compared with the canonical Gaussians. A singular value
-//! decomposition of a sample of the Gaussians gives functions of time per head and segment, in order of importance; every Gaussian then takes as many of them, and
-//! coefficients as fine, as its own tolerance needs. The error is measured on the quantised result: at all samples of all Gaussians, and half way between
+//! decomposition of a sample of the Gaussians gives functions of time per head and segment, in order of importance; every Gaussian then takes as many of them,
+//! and coefficients as fine, as its own tolerance needs. The error is measured on the quantised result: at all samples of all Gaussians, and half way between
 //! samples of up to 1,024 of them.
 
 mod archive;
@@ -130,8 +130,8 @@ pub struct HeadReport {
 /// The motion of `model` as a playback layer; `None` if nothing moves. `device` is that of the model's deformer.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a bound that is not positive; [`Error::Interrupted`] where something moves and `options.stop` is set; [`Error::Limit`] for a layer with
-/// larger numbers than its format holds; what the deformer reports.
+/// [`Error::Parameter`] for a bound that is not positive; [`Error::Interrupted`] where something moves and `options.stop` is set; [`Error::Limit`] for a layer
+/// with larger numbers than its format holds; what the deformer reports.
 pub fn bake(model: &Model, options: &BakeOptions, device: &Device, events: &dyn EventSink) -> Result<Option<Baked>> {
     options.max_error.check()?;
     let Some(motion) = Motion::of(model, device, options.stop)? else { return Ok(None) };

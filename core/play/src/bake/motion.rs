@@ -135,7 +135,8 @@ impl<'a> Motion<'a> {
                     let position = |g: &HostGaussians| -> [f32; 3] { std::array::from_fn(|k| g.means[3 * i + k]) };
                     let step = (samples / POSITIONS).max(1);
                     let positions: Vec<[f32; 3]> = moved.iter().step_by(step).map(position).collect();
-                    // Errors of scales and rotations show most where the deformer makes the Gaussian largest, and those of rotations where it makes the quaternion shortest.
+                    // Errors of scales and rotations show most where the deformer makes the Gaussian largest, and those of rotations where it makes the
+                    // quaternion shortest.
                     let largest = |most: f32, g: &HostGaussians| g.log_scales[3 * i..3 * i + 3].iter().copied().fold(most, f32::max);
                     let norms = Norms::of(&moved, i);
                     tolerances.of(&positions, moved.iter().fold(f32::NEG_INFINITY, largest).exp(), norms.least / norms.mean)

@@ -40,8 +40,8 @@ impl Tolerances {
             }
         }
     }
-    /// The tolerances of the heads in the order of [`Head::ALL`], for a Gaussian that is at `positions` over time, whose largest scale over time is `scale`, and
-    /// whose quaternions, as they are stored, are at least `shortest` long, which is at most 1.
+    /// The tolerances of the heads in the order of [`Head::ALL`], for a Gaussian that is at `positions` over time, whose largest scale over time is `scale`,
+    /// and whose quaternions, as they are stored, are at least `shortest` long, which is at most 1.
     pub(super) fn of(&self, positions: &[[f32; 3]], scale: f32, shortest: f32) -> [f32; 5] {
         let length = self.length(positions);
         let reach = (EDGE * scale).max(f32::MIN_POSITIVE);

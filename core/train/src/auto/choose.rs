@@ -13,8 +13,8 @@ use toml::Value;
 const PIXELS_PER_THREAD_MINUTE: f64 = 1.0e4;
 /// How many threads a graphics card stands for.
 const GRAPHICS_THREADS: f64 = 100.0;
-/// Minutes of a graphics card from which fields have their full size. With it an H200 took 36 ms per iteration for 40,200 moving Gaussians, whatever the views, and 3 to
-/// 4 ms per view for the rest. The two sizes were not compared on a card.
+/// Minutes of a graphics card from which fields have their full size. With it an H200 took 36 ms per iteration for 40,200 moving Gaussians, whatever the views,
+/// and 3 to 4 ms per view for the rest. The two sizes were not compared on a card.
 const FULL_SIZE_MINUTES: f64 = 10.0;
 /// Images up to this much larger than that are left as they are.
 const SPARE: f64 = 1.4;
@@ -206,8 +206,8 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, stated: Option<&str>, ke
         let reason = format!("{} cameras see each frame: what moves starts with points of key frames, each with a velocity and a life", facts.cameras);
         return choice([("deformer.kind", FREE_TIME.into()), ("train.key_frames", integer(every as f64))], reason);
     }
-    // Where poses have nothing to do with each other, stored features are 0.8 to 1.5 dB better than decoded ones on mutant and as good on the built-in turntable;
-    // where one camera moves through time they are 0.2 dB worse.
+    // Where poses have nothing to do with each other, stored features are 0.8 to 1.5 dB better than decoded ones on mutant and as good on the built-in
+    // turntable; where one camera moves through time they are 0.2 dB worse.
     let stored = match stated {
         Some(kind) => kind == HASH_BASIS,
         None => facts.arrangement == Arrangement::OneCameraAnywhere,
@@ -224,8 +224,8 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, stated: Option<&str>, ke
     let mut settings = vec![("deformer.kind", kind.into()), ("deformer.time_bands", Value::Integer(bands)), ("deformer.cycles", Value::Float(cycles))];
     if stored {
         settings.push(("deformer.log2_rows", Value::Integer(if short { 13 } else { 15 })));
-        // The features are weights themselves. Without hidden layers in the heads, plans of five minutes of one thread on mutant run 1.4 to 2 times the iterations
-        // and have 0.3 to 1.1 dB more.
+        // The features are weights themselves. Without hidden layers in the heads, plans of five minutes of one thread on mutant run 1.4 to 2 times the
+        // iterations and have 0.3 to 1.1 dB more.
         settings.push(("deformer.head_layers", Value::Integer(0)));
     } else if short && facts.arrangement == Arrangement::OneCameraAnywhere {
         // The penalty that takes unneeded functions out also makes needed ones smaller. Short runs of mutant have 0.3 dB more without it, 1.1 and 4.1 on the

@@ -1,5 +1,5 @@
-//! The preset `auto`: a plan made by looking at the scene, the machine and the time there is. Every choice is stated with its reason, written into `config.toml`, and
-//! can be overridden.
+//! The preset `auto`: a plan made by looking at the scene, the machine and the time there is. Every choice is stated with its reason, written into
+//! `config.toml`, and can be overridden.
 
 mod calibrate;
 mod choose;

@@ -11,8 +11,8 @@ pub(super) const GOOD_ENOUGH_DB: f64 = 30.0;
 const MOTION_GAIN_DB: f64 = 0.3;
 /// What a model must gain on the blurred images where poses or times are in doubt, dB.
 const DOUBT_MARGIN_DB: f64 = 3.0;
-/// What a model of images that all state one time must reach, dB, whole and blurred. Static scenes that are hardly trained reach 24 with 41 to 42 where they are blurred,
-/// because what is missing is detail; of things that move the blurred images differ, too: 23 with 32.
+/// What a model of images that all state one time must reach, dB, whole and blurred. Static scenes that are hardly trained reach 24 with 41 to 42 where they
+/// are blurred, because what is missing is detail; of things that move the blurred images differ, too: 23 with 32.
 const ONE_TIME_DB: f64 = 26.0;
 const ONE_TIME_BLURRED_DB: f64 = 37.0;
 /// A run has failed whose scores in the main stage are more than this below the score that the stage began with, dB: rounds of density control cost some.
@@ -98,8 +98,8 @@ pub(super) fn shortfall(scores: &[Score], still_db: Option<f64>, baselines: &Bas
     Some(Shortfall::Motion(words))
 }
 
-/// How far a run has fallen whose last score is more than 6 dB below its best earlier one, in words. All scores are of the same views at their full size. Scores
-/// before `complete` do not count: the iteration of the main stage after which no frames and pixels are added.
+/// How far a run has fallen whose last score is more than 6 dB below its best earlier one, in words. All scores are of the same views at their full size.
+/// Scores before `complete` do not count: the iteration of the main stage after which no frames and pixels are added.
 pub(super) fn collapse(scores: &[Score], complete: usize, lengths: &StageLengths, baselines: &Baselines) -> Option<String> {
     let (end, earlier) = scores.split_last()?;
     let counts = |score: &&Score| score.percent > 0 && lengths.scored_at(score.percent) >= complete;

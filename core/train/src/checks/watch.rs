@@ -57,8 +57,8 @@ impl Watch {
         }
         Ok(())
     }
-    /// To be called after every iteration; scores the model at half and at 85 % of the main stage, once its length is settled. Returns the error of a run that has
-    /// failed at both: it is to be stopped.
+    /// To be called after every iteration; scores the model at half and at 85 % of the main stage, once its length is settled. Returns the error of a run that
+    /// has failed at both: it is to be stopped.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<Option<Error>> {
         if schedule.stage != Stage::Main || !context.job.config.train.checks {
             return Ok(None);

@@ -76,8 +76,8 @@ fn unsupported(object: &str, model: &str) -> Error {
 }
 
 impl ColmapCamera {
-    /// Focal lengths and principal point in pixels, lens. Errors, about the camera `object`: [`Error::Unsupported`] for models that are not read, [`Error::Data`] for
-    /// numbers that `EUCM` cannot have.
+    /// Focal lengths and principal point in pixels, lens. Errors, about the camera `object`: [`Error::Unsupported`] for models that are not read,
+    /// [`Error::Data`] for numbers that `EUCM` cannot have.
     pub(crate) fn intrinsics(&self, object: &str) -> Result<([f64; 2], [f64; 2], Distortion)> {
         let brown = |k1: f64, k2: f64, p1: f64, p2: f64| Distortion::Brown { radial: [k1, k2, 0.0, 0.0], tangential: [p1, p2] };
         let fisheye = |radial: [f64; 4]| Distortion::Fisheye { radial };

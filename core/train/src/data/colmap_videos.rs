@@ -29,9 +29,9 @@ fn matched<'a>(names: &[String], videos: &'a BTreeMap<String, PathBuf>) -> Vec<O
     names.iter().map(|name| videos.get(name).filter(|_| seen.insert(name))).collect()
 }
 
-/// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, or for `cam00/0001.png` where not every image has a video of its own name and each lies
-/// in a folder of its own. They are in the folder of the project or in its `videos/`, also where `path` is the folder of a model in `sparse/`. Empty unless each
-/// image has one. Hidden files do not count.
+/// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, or for `cam00/0001.png` where not every image has a video of its own name and each
+/// lies in a folder of its own. They are in the folder of the project or in its `videos/`, also where `path` is the folder of a model in `sparse/`. Empty
+/// unless each image has one. Hidden files do not count.
 fn video_files(path: &Path, images: &[ColmapImage], warnings: &mut Vec<String>) -> Result<Vec<PathBuf>> {
     let project = project_folder(path);
     let own = (project != path).then(|| [path.join("videos"), path.to_path_buf()]);

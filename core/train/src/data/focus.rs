@@ -4,11 +4,11 @@ use glam::{DMat3, DVec3};
 
 /// A pull towards the expected distance, as a share of the number of cameras: axes that converge by less than about two degrees leave the distance open.
 const PULL: f64 = 1e-3;
-/// Cameras whose positions differ by less than this share of their coordinates, or of 1, stand at one point: that is what rounding leaves of products of rotations
-/// and translations.
+/// Cameras whose positions differ by less than this share of their coordinates, or of 1, stand at one point: that is what rounding leaves of products of
+/// rotations and translations.
 const ONE_POINT: f64 = 1e-12;
-/// Cameras whose positions differ by less than this share of the distance of what they see stand at one point: a thousandth of a pixel at a focal length of 10,000
-/// pixels, and what float32 leaves of positions.
+/// Cameras whose positions differ by less than this share of the distance of what they see stand at one point: a thousandth of a pixel at a focal length of
+/// 10,000 pixels, and what float32 leaves of positions.
 const NO_PARALLAX: f64 = 1e-7;
 /// How many times the rig's width a rig of parallel axes is expected to look ahead, where nothing else is known.
 const AHEAD: f64 = 3.0;

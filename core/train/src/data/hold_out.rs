@@ -9,7 +9,8 @@ const CAMERAS_PER_VALIDATION: usize = 12;
 /// Fewest such cameras of which one is kept out; below, single images are.
 const LEAST_CAMERAS: usize = 4;
 
-/// `scene` with validation views among its training views; where a reader already named some, they stay the only ones. A function of the scene and `count` alone.
+/// `scene` with validation views among its training views; where a reader already named some, they stay the only ones. A function of the scene and `count`
+/// alone.
 ///
 /// Where training cameras have several frames, whole cameras are kept out, evenly spread: a camera whose other frames are trained on says nothing of new
 /// viewpoints. Else `count` single images are, evenly spread over the cameras and the frames of each. With a `count` of 0 nothing changes.

@@ -8,8 +8,8 @@ const ONE_INSTANT: f64 = 0.25;
 /// Share of all images that are taken so: cameras of different rates meet at half of theirs.
 const TOGETHER: f64 = 0.75;
 
-/// Where nearly all images are taken by most cameras together, at times that differ by a small share of the time between two images of a camera, the images of an
-/// instant become one frame, and a warning says so. Each keeps its own time. Frames of other scenes stay as they are.
+/// Where nearly all images are taken by most cameras together, at times that differ by a small share of the time between two images of a camera, the images of
+/// an instant become one frame, and a warning says so. Each keeps its own time. Frames of other scenes stay as they are.
 pub(super) fn join_instants(views: &mut [RawView], warnings: &mut Vec<String>) {
     let Some(times) = views.iter().map(|view| view.time).collect::<Option<Vec<f64>>>() else { return };
     let mut order: Vec<usize> = (0..views.len()).collect();

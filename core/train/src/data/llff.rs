@@ -173,9 +173,9 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     Ok(found)
 }
 
-/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`: instants are `step` numbers
-/// apart, and one whose number is missing has no image. Other files come in the order of their names, in which numbers count as numbers: `2_left` before
-/// `10_left`.
+/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`: instants are `step`
+/// numbers apart, and one whose number is missing has no image. Other files come in the order of their names, in which numbers count as numbers: `2_left`
+/// before `10_left`.
 fn frames(mut files: Vec<PathBuf>, step: Option<u64>, warnings: &mut Vec<String>) -> Vec<Option<ImageSource>> {
     let step = step.filter(|_| least_step(&files).is_some());
     let image = |path: PathBuf| Some(ImageSource::file(path));
@@ -229,8 +229,8 @@ fn least_step(files: &[PathBuf]) -> Option<u64> {
     numbers.windows(2).map(|pair| pair[1] - pair[0]).min().filter(|step| *step > 0)
 }
 
-/// The number at the end of a file's name. Of a name that is a time with decimals, such as `12.040`, all digits count, in units of the last decimal: those after
-/// the point begin anew every second.
+/// The number at the end of a file's name. Of a name that is a time with decimals, such as `12.040`, all digits count, in units of the last decimal: those
+/// after the point begin anew every second.
 fn frame_number(path: &Path) -> Option<u64> {
     let stem = stem(path);
     let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());

@@ -1,7 +1,7 @@
 //! The normalised frame: what the cameras look at is the origin, and they stand about four units away.
 //!
-//! Near planes, paddings, thresholds and the sizes fields begin with are numbers of this frame, so that a scene trains equally well whatever its unit and origin.
-//! Four units is where the cameras of D-NeRF's scenes are, which those numbers were first chosen for.
+//! Near planes, paddings, thresholds and the sizes fields begin with are numbers of this frame, so that a scene trains equally well whatever its unit and
+//! origin. Four units is where the cameras of D-NeRF's scenes are, which those numbers were first chosen for.
 
 use super::focus::focus;
 use cc4dgs_core::{RawScene, Similarity, Split};

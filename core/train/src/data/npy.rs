@@ -17,7 +17,8 @@ const MAX_HEADER_BYTES: usize = 4096;
 
 /// Reads an array of `<f4`, `<f8` (or big-endian) values in C order; `object` names the source in errors.
 ///
-/// Errors: [`Error::Data`] for anything malformed, [`Error::Limit`] for arrays over `limits.max_bytes`. Nothing is allocated for a claim the bytes do not cover.
+/// Errors: [`Error::Data`] for anything malformed, [`Error::Limit`] for arrays over `limits.max_bytes`. Nothing is allocated for a claim the bytes do not
+/// cover.
 pub fn read_npy(object: &str, bytes: &[u8], limits: &Limits) -> Result<NpyArray> {
     let bad = |problem: String| Error::data(object, problem, "Save it again with numpy.save, as float32 or float64 in C order");
     check_header(bytes).map_err(bad)?;

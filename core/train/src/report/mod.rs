@@ -122,8 +122,8 @@ fn folder_of_images(path: &Path) -> &Path {
     if is_inner { around(own) } else { own }
 }
 
-/// Makes the report of the results in `path` (see [`read_results`]); of a sweep's folder, those of the cells of its plan. The folder of images is `path` itself,
-/// or the folder of a file; if that is called `results` and has no images, the one around it.
+/// Makes the report of the results in `path` (see [`read_results`]); of a sweep's folder, those of the cells of its plan. The folder of images is `path`
+/// itself, or the folder of a file; if that is called `results` and has no images, the one around it.
 ///
 /// # Errors
 /// What reading reports; [`Error::Data`] for results that do not belong into one table, and for damaged images; [`Error::Parameter`] for options.

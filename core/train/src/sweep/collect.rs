@@ -54,7 +54,8 @@ pub struct Tables {
     pub csv: PathBuf,
 }
 
-/// Looks for the result of every cell of `plan`. Names of the grid are no part of a cell: results of an earlier plan get those of this one, in their files as well.
+/// Looks for the result of every cell of `plan`. Names of the grid are no part of a cell: results of an earlier plan get those of this one, in their files as
+/// well.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -152,8 +153,8 @@ pub fn write_tables(folder: &SweepFolder, results: &[CellResult], shown: &[CellR
 /// The keys that [`select`] knows.
 const KEYS: [&str; 10] = ["scene", "method", "setting", "codec", "seed", "device", "adapter", "processor", "threads", "split"];
 
-/// The results that `conditions` ask for, each `KEY=VALUE` with one of the keys scene, method, setting, codec, seed, device, adapter, processor, threads and split. Several values of one key
-/// are alternatives; all keys must hold.
+/// The results that `conditions` ask for, each `KEY=VALUE` with one of the keys scene, method, setting, codec, seed, device, adapter, processor, threads and
+/// split. Several values of one key are alternatives; all keys must hold.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other keys, and for conditions that no result meets.

@@ -1,5 +1,7 @@
 //! The trainings of a plan as jobs of schedulers. Each index runs `cc4dgs sweep run DIR --plan ID --index I`: the training and the cells it lacks.
 
+mod slurm;
+
 use super::location::variable_of;
 use super::plan::Plan;
 use cc4dgs_core::{Error, Result, plural};
@@ -14,10 +16,6 @@ const FINAL: [u8; 3] = [2, 3, 6];
 const INDEX_VARIABLES: [&str; 4] = ["SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "INDEX"];
 /// Seconds before a time limit at which a job is asked to stop.
 const NOTICE_SECONDS: u32 = 120;
-/// Least time limit of a job of Slurm, minutes. Slurm may give the notice a minute earlier, and a task that is stopped at once is queued again without end.
-const LEAST_SLURM_MINUTES: u32 = 4;
-/// Most tasks of an array of Slurm, whose `MaxArraySize` is 1001 by default: indices are below it.
-const MOST_TASKS: usize = 1001;
 
 /// A scheduler.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -83,20 +81,20 @@ pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<
     if o.threads == 0 || o.memory_gb == 0 || o.minutes == 0 {
         return Err(Error::parameter("sweep emit", "threads, memory and minutes are positive", "Give --threads, --memory-gb and --time-limit"));
     }
-    if scheduler == Scheduler::Slurm && folder_of_logs(o).contains('\\') {
-        let problem = format!("'{}' has a backslash, and names of Slurm's logs would then not get the index of their task", folder_of_logs(o));
+    if scheduler == Scheduler::Slurm && slurm::folder_of_logs(o).contains('\\') {
+        let problem = format!("'{}' has a backslash, and names of Slurm's logs would then not get the index of their task", slurm::folder_of_logs(o));
         return Err(Error::parameter("folder", problem, "Use another folder, or name it by a link without a backslash (--job-dir)"));
     }
-    if scheduler == Scheduler::Slurm && o.minutes < LEAST_SLURM_MINUTES {
+    if scheduler == Scheduler::Slurm && o.minutes < slurm::LEAST_MINUTES {
         let problem = format!("{} minutes: Slurm asks a task to stop up to three minutes before its limit, so it would be queued again without end", o.minutes);
-        return Err(Error::parameter("--time-limit", problem, format!("Give at least {LEAST_SLURM_MINUTES} minutes")));
+        return Err(Error::parameter("--time-limit", problem, format!("Give at least {} minutes", slurm::LEAST_MINUTES)));
     }
     if scheduler == Scheduler::SkyPilot && o.parallel > 0 {
         let problem = format!("{}: SkyPilot itself decides how many managed jobs run at a time", o.parallel);
         return Err(Error::parameter("--parallel", problem, "Leave it out, and launch the indices in parts"));
     }
     Ok(match scheduler {
-        Scheduler::Slurm => slurm(plan, o, &variables),
+        Scheduler::Slurm => slurm::script(plan, o, &variables),
         Scheduler::Kubernetes => kubernetes(plan, o, &variables),
         Scheduler::SkyPilot => skypilot(plan, o, &variables),
     })
@@ -160,17 +158,6 @@ fn limit_options(o: &EmitOptions) -> String {
     o.limits.iter().map(|limit| format!("--limit {} ", quoted(limit))).collect()
 }
 
-/// The folder of Slurm's logs. Slurm looks for a relative one where `sbatch` is called, and the program in its working folder, where it has to be.
-fn folder_of_logs(o: &EmitOptions) -> String {
-    let root = if o.folder.starts_with('/') { String::new() } else { format!("{}/", o.working_folder.trim_end_matches('/')) };
-    format!("{root}{}/logs", o.folder)
-}
-
-/// `text`, which has no backslash, as one word of an `#SBATCH` line. sbatch reads these lines by rules of its own: a backslash escapes within quotes, too.
-fn sbatch_quoted(text: &str) -> String {
-    format!("\"{}\"", text.replace('"', "\\\""))
-}
-
 /// Seconds after which a job is asked to stop, so that it leaves its checkpoint before its time limit of so many minutes.
 fn stop_after(minutes: u32) -> u64 {
     // Limits of two minutes or less have no time for a notice. Kubernetes takes at most 2^31 - 1.
@@ -192,82 +179,6 @@ fn job_name(plan: &Plan) -> String {
 fn extent(plan: &Plan) -> String {
     let (trainings, cells) = (plan.trainings.len(), plan.cells.len());
     format!("{trainings} {}, {cells} {}", plural(trainings, "training", "trainings"), plural(cells, "cell", "cells"))
-}
-
-/// What a task of Slurm does: it runs `command` with the index of its training, and `code` is then the exit code. With more than [`MOST_TASKS`] trainings it runs
-/// every so many, one after the other: an error of one does not end the others, and a task that is queued again goes on where it was.
-fn slurm_work(command: &str, trainings: usize) -> String {
-    let one = |index: &str| {
-        format!(
-            r#"{command} --index "${index}" &
-work=$!
-# A signal ends a wait. The last one finds the program ended, and has its exit code.
-while kill -0 "$work" 2>/dev/null; do
-    wait "$work"
-done
-wait "$work"
-code=$?
-"#
-        )
-    };
-    if trainings <= MOST_TASKS {
-        return one("SLURM_ARRAY_TASK_ID");
-    }
-    format!(
-        r#"# Slurm takes {MOST_TASKS} tasks by default (MaxArraySize), so a task has several trainings, one after the other.
-code=0 failed=0
-for ((index = SLURM_ARRAY_TASK_ID; index < {trainings}; index += {MOST_TASKS})); do
-{}if [ "$code" -ne 0 ] && [ "$code" -ne {INTERRUPTED} ]; then failed=$code; fi
-if [ "$notice" ]; then code={INTERRUPTED}; fi
-if [ "$code" -eq {INTERRUPTED} ]; then break; fi
-done
-if [ "$code" -ne {INTERRUPTED} ]; then code=$failed; fi
-"#,
-        one("index")
-    )
-}
-
-fn slurm(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {
-    let trainings = plan.trainings.len();
-    let last = trainings.min(MOST_TASKS) - 1;
-    let (program, limits, folder) = (quoted(&o.program), limit_options(o), quoted(&o.folder));
-    let command = format!("{program} --quiet --threads {} {limits}sweep run {folder} --plan {}", o.threads, plan.id());
-    let throttle = if o.parallel > 0 { format!("%{}", o.parallel) } else { String::new() };
-    let output = sbatch_quoted(&format!("{}/slurm-%a.log", folder_of_logs(o).replace('%', "%%")));
-    format!(
-        r#"#!/bin/bash
-# {extent}. Submit with: sbatch FILE. A task that is stopped before its time limit, or preempted, leaves a checkpoint and
-# is queued again; finished cells are never run twice. A task that is cancelled leaves a checkpoint, too, and is not queued again.
-#SBATCH --job-name={name}
-#SBATCH --array=0-{last}{throttle}
-#SBATCH --cpus-per-task={threads}
-#SBATCH --mem={memory}M
-#SBATCH --time={minutes}
-#SBATCH --requeue
-#SBATCH --open-mode=append
-#SBATCH --signal=B:USR1@{NOTICE_SECONDS}
-#SBATCH --output={output}
-set -u
-{variables}cd {cd} || exit 2
-# The notice before the time limit comes to this shell alone. Cancelling and preemption signal every process, the program too, and Slurm itself queues preempted
-# tasks again.
-work= notice=
-trap 'notice=yes; kill -TERM "$work" 2>/dev/null' USR1
-trap : TERM INT
-{work}if [ "$notice" ] && [ "$code" -eq {INTERRUPTED} ]; then
-    scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}" || true
-fi
-exit "$code"
-"#,
-        extent = extent(plan),
-        name = job_name(plan),
-        threads = o.threads,
-        memory = u64::from(o.memory_gb) * 1_000_000_000 / (1 << 20),
-        minutes = o.minutes,
-        variables = variables.iter().map(|(name, value)| format!("export {name}={}\n", quoted(value))).collect::<String>(),
-        cd = quoted(&o.working_folder),
-        work = slurm_work(&command, trainings),
-    )
 }
 
 fn kubernetes(plan: &Plan, o: &EmitOptions, variables: &BTreeMap<String, String>) -> String {

@@ -55,8 +55,8 @@ fn list(root: &Path) -> Result<Vec<DataFile>> {
     Ok(files)
 }
 
-/// The folder of everything that readers take from the dataset at `path`: of a file the one it lies in, since images are named relative to it; of a COLMAP model in
-/// a folder `sparse`, or in a folder of it, that of its project, where its images are; of any other model its own.
+/// The folder of everything that readers take from the dataset at `path`: of a file the one it lies in, since images are named relative to it; of a COLMAP
+/// model in a folder `sparse`, or in a folder of it, that of its project, where its images are; of any other model its own.
 fn root_of(path: &Path) -> PathBuf {
     if path.is_file() {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());

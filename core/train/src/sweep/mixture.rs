@@ -1,5 +1,5 @@
-//! What the trainings of a table differ in beside their seeds. A plan sized in minutes times the machine, and may choose other settings for one seed than for the
-//! next: the deviation of such a row is not that of its seeds alone, and tables say so. They also say which trainings learned from fewer views than others.
+//! What the trainings of a table differ in beside their seeds. A plan sized in minutes times the machine, and may choose other settings for one seed than for
+//! the next: the deviation of such a row is not that of its seeds alone, and tables say so. They also say which trainings learned from fewer views than others.
 
 use super::result::CellResult;
 use serde_json::Value;
@@ -19,8 +19,8 @@ pub(crate) fn notes<'a>(rows: impl IntoIterator<Item = (String, &'a [&'a CellRes
     rows.into_iter().filter_map(of).collect()
 }
 
-/// A note on those `rows`, each a name and its results, where their trainings kept different numbers of views out (`train.validation`), whatever they are scored
-/// on: some learned from fewer views.
+/// A note on those `rows`, each a name and its results, where their trainings kept different numbers of views out (`train.validation`), whatever they are
+/// scored on: some learned from fewer views.
 pub(crate) fn kept_out<'a>(rows: impl IntoIterator<Item = (String, &'a [&'a CellResult])>) -> Option<String> {
     let views = |result: &&CellResult| result.provenance.configuration.pointer("/train/validation").map_or_else(|| "0".to_string(), ToString::to_string);
     let mut found: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();

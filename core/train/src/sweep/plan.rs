@@ -335,7 +335,8 @@ fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &
     config::parse_table("configuration", &known.completed(registry)?.to_toml()?)
 }
 
-/// Refuses trainings of one scene whose images would have different sizes, of which no table is made: where no size is stated, `auto` chooses it by the minutes.
+/// Refuses trainings of one scene whose images would have different sizes, of which no table is made: where no size is stated, `auto` chooses it by the
+/// minutes.
 fn refuse_image_sizes(trainings: &[PlannedTraining], registry: &Registry) -> Result<()> {
     let mut chosen: BTreeMap<&str, (&PlannedTraining, Option<f64>)> = BTreeMap::new();
     for training in trainings {

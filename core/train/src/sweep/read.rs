@@ -80,9 +80,9 @@ fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
     if of_lines { read_lines(&object, &text) } else { Ok(vec![CellResult::from_json(&object, &text)?]) }
 }
 
-/// Refuses results that do not belong into one table: computed on different devices, scored on different sides of the split, by different protocols of a metric,
-/// or, within a scene, on different data, image sizes or images; and results that differ in their seed alone by their axes, but were stored by different codecs.
-/// Those that were trained on different devices are marked in tables instead.
+/// Refuses results that do not belong into one table: computed on different devices, scored on different sides of the split, by different protocols of a
+/// metric, or, within a scene, on different data, image sizes or images; and results that differ in their seed alone by their axes, but were stored by
+/// different codecs. Those that were trained on different devices are marked in tables instead.
 ///
 /// # Errors
 /// [`Error::Data`] that names two of the results and what differs.

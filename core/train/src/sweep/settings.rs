@@ -38,8 +38,8 @@ fn assignments(table: &toml::Table, prefix: &str, to: &mut Vec<String>) {
     }
 }
 
-/// All settings of `stated`, in order, as overrides of `preset` for [`config::set_all`]: a plan does not change with the files. As in `cc4dgs train --config FILE
-/// --set SECTION.kind=NAME`, a change of `kind` over a file drops the other settings that the file has of this section.
+/// All settings of `stated`, in order, as overrides of `preset` for [`config::set_all`]: a plan does not change with the files. As in `cc4dgs train --config
+/// FILE --set SECTION.kind=NAME`, a change of `kind` over a file drops the other settings that the file has of this section.
 ///
 /// # Errors
 /// [`Error::Parameter`] for text that is not `key=value`.

@@ -1,9 +1,9 @@
 //! Capacities for (Gaussian, tile) pairs, so that an iteration need not wait for the device before it draws.
 //!
 //! How many pairs a view has is known on the device alone. Reading the number back in the middle of every view leaves a graphics card idle while the launches
-//! behind it are prepared. So a view is drawn with a capacity: as many pairs as its camera had before, and a quarter more. The numbers of all views are read after the
-//! backward pass was launched. If a view had more pairs than its capacity, the iteration is repeated, and pairs are counted before views are drawn. So what is learned
-//! never depends on capacities, and checkpoints do not keep them.
+//! behind it are prepared. So a view is drawn with a capacity: as many pairs as its camera had before, and a quarter more. The numbers of all views are read
+//! after the backward pass was launched. If a view had more pairs than its capacity, the iteration is repeated, and pairs are counted before views are drawn.
+//! So what is learned never depends on capacities, and checkpoints do not keep them.
 
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, RenderOutput, Result};
@@ -11,8 +11,8 @@ use std::collections::BTreeMap;
 
 /// Capacity as a multiple of the pairs that a camera had when it was last drawn.
 const SPARE: f64 = 1.25;
-/// A capacity that is larger than needed falls by this part of itself (one over it) whenever its camera is drawn, and not at once: pairs change with the time of a
-/// view. [`rounded_up`] adds less than that.
+/// A capacity that is larger than needed falls by this part of itself (one over it) whenever its camera is drawn, and not at once: pairs change with the time
+/// of a view. [`rounded_up`] adds less than that.
 const FALL: usize = 8;
 
 /// The camera of a view, and the width and height of its image in pixels.

@@ -15,8 +15,8 @@ const MEASUREMENTS: usize = 3;
 const ITERATIONS: usize = 4;
 
 /// The share of an iteration of `model`'s main stage that its views do not share, 0 to 1: with `v` of it, an iteration of `k` views takes `1 + (k - 1) v` times
-/// as long as one of a single view. Found by training for a few iterations with `views` views, or as many as the scene has, and with one; the result is forgotten.
-/// 0 where there is only one view.
+/// as long as one of a single view. Found by training for a few iterations with `views` views, or as many as the scene has, and with one; the result is
+/// forgotten. 0 where there is only one view.
 ///
 /// # Errors
 /// [`Error::Backend`] for what is not finite, and what scene and plug-ins report.

@@ -47,8 +47,8 @@ fn check_step(kind: &str, set: &GaussianSet, name: &str, values: &Tensor<2>) -> 
 }
 
 impl Context<'_> {
-    /// How many Gaussians key frames or recovery may add where there are `now`: as many as `density.max_gaussians` leaves, or [`least_added`] if that is more. `None`
-    /// for density controls without such a bound.
+    /// How many Gaussians key frames or recovery may add where there are `now`: as many as `density.max_gaussians` leaves, or [`least_added`] if that is more.
+    /// `None` for density controls without such a bound.
     pub(super) fn most_added(&self, now: usize) -> Option<usize> {
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer)?;
         Some((most.max(0) as usize).saturating_sub(now).max(least_added(now)))
@@ -91,7 +91,8 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// Removes the Gaussians with a value that is not finite, which are not drawn and cannot be stored: after the last round of a density control nobody else does.
+    /// Removes the Gaussians with a value that is not finite, which are not drawn and cannot be stored: after the last round of a density control nobody else
+    /// does.
     pub(crate) fn remove_broken(&self, state: &mut TrainState) -> Result<()> {
         let broken = broken_rows(state)?;
         let count = broken.iter().filter(|broken| **broken).count();

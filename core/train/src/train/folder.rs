@@ -50,8 +50,8 @@ pub fn check_unused(out: &Path) -> Result<()> {
     FolderLock::take(out).map(drop)
 }
 
-/// Begins a run in the folder `out`, which is created if missing, and takes its `lock` unless that was done. The checkpoint of a run that is overwritten goes, because
-/// it has other settings, but not before the settings of the new run are written: a full disk leaves the run before.
+/// Begins a run in the folder `out`, which is created if missing, and takes its `lock` unless that was done. The checkpoint of a run that is overwritten goes,
+/// because it has other settings, but not before the settings of the new run are written: a full disk leaves the run before.
 ///
 /// # Errors
 /// As [`FolderLock::take`], and [`Error::Io`].

@@ -1,5 +1,5 @@
-//! The three-stage trainer (paper Section V): coarse, dynamic score, main. It is composed of parts that are found by name: deformer, rasterizer, density control, loss terms,
-//! appearance model, pose model and optimizer.
+//! The three-stage trainer (paper Section V): coarse, dynamic score, main. It is composed of parts that are found by name: deformer, rasterizer, density
+//! control, loss terms, appearance model, pose model and optimizer.
 
 mod capacity;
 mod cost;
@@ -158,8 +158,8 @@ pub(crate) struct Context<'a> {
 /// [`Error::Parameter`] for settings out of range and for a folder that another training writes into, before anything is written, and for going on without a
 /// folder, [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with
 /// lower rates, [`Error::Data`] for a scene that cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far
-/// below its own earlier scores (the checkpoint is kept), and whatever the scene, the plug-ins or the disk report. A checkpoint is written before the error of an
-/// image that cannot be read any more.
+/// below its own earlier scores (the checkpoint is kept), and whatever the scene, the plug-ins or the disk report. A checkpoint is written before the error of
+/// an image that cannot be read any more.
 ///
 /// [`Error::Parameter`]: cc4dgs_core::Error::Parameter
 /// [`Error::Interrupted`]: cc4dgs_core::Error::Interrupted

@@ -42,8 +42,8 @@ pub struct Snapshot {
 
 /// Looks at a model while it trains. What an observer does changes no byte of the result.
 pub trait Observer: Send + Sync {
-    /// Called after every iteration, on the thread that trains. Returns at how many times the observer wants to see the model now, 0 for none. It may block, which
-    /// pauses the training, and must return soon after `stop` was set.
+    /// Called after every iteration, on the thread that trains. Returns at how many times the observer wants to see the model now, 0 for none. It may block,
+    /// which pauses the training, and must return soon after `stop` was set.
     fn after_iteration(&self, standing: &Standing, stop: &AtomicBool) -> usize;
     /// Receives what [`Observer::after_iteration`] asked for.
     fn receive(&self, snapshot: Snapshot);

@@ -1,9 +1,9 @@
 //! The length of the main stage of a run that has a time to end at: settled after its first fifth, or once images have had their full size for a while, by the
 //! time of the last iterations until then. Earlier ones tell less: Gaussians that have just begun to learn cover more pixels.
 //!
-//! A plan times a few iterations of Gaussians that have not been trained. Trained ones take between two thirds of that and a fifth more, for reasons that differ
-//! from scene to scene: how much they overlap, how many there are, how many move. What was settled is written into the run's settings as `train.stretch`, so that
-//! a run from them repeats it without a clock.
+//! A plan times a few iterations of Gaussians that have not been trained. Trained ones take between two thirds of that and a fifth more, for reasons that
+//! differ from scene to scene: how much they overlap, how many there are, how many move. What was settled is written into the run's settings as
+//! `train.stretch`, so that a run from them repeats it without a clock.
 
 use super::folder::write_settings;
 use super::{Context, TrainState};

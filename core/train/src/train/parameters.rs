@@ -24,9 +24,9 @@ pub(crate) fn track(parameters: Vec<&mut Parameter>) {
     }
 }
 
-/// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `rate` gives the learning
-/// rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead. Arrays that have
-/// steps are stepped in these, at the rate of [`ExactWeights`], with the size's derivatives added after clipping.
+/// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `rate` gives the
+/// learning rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead. Arrays that have steps are
+/// stepped in these, at the rate of [`ExactWeights`], with the size's derivatives added after clipping.
 pub(crate) fn update(
     prefix: &str,
     mut parameters: Vec<&mut Parameter>,

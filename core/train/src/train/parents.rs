@@ -1,5 +1,5 @@
-//! Parents of the Gaussians that key frames and recovery add. A new Gaussian has from its parent what is not set explicitly: the attributes of plug-ins, such as
-//! learned vectors, and a share of the optimizer's second moment.
+//! Parents of the Gaussians that key frames and recovery add. A new Gaussian has from its parent what is not set explicitly: the attributes of plug-ins, such
+//! as learned vectors, and a share of the optimizer's second moment.
 
 use crate::knn::KdTree;
 use cc4dgs_core::{DensityPlan, HostGaussians};
@@ -38,8 +38,8 @@ mod tests {
     use burn::tensor::Device;
     use cc4dgs_core::{ExtraAttribute, Gaussians};
 
-    /// Four Gaussians on the x axis, with two attributes of plug-ins: one that stands still at 0, one that moves at 1, one that is not finite at 2, one that moves
-    /// at 10.
+    /// Four Gaussians on the x axis, with two attributes of plug-ins: one that stands still at 0, one that moves at 1, one that is not finite at 2, one that
+    /// moves at 10.
     fn four() -> HostGaussians {
         let mut host = HostGaussians {
             means: [0.0, 1.0, 2.0, 10.0].iter().flat_map(|&x| [x, 0.0, 0.0]).collect(),

@@ -24,8 +24,8 @@ impl Sampler {
     pub fn new(views: Vec<usize>, seed: Seed, batch: usize) -> Self {
         Self { opens: vec![0; views.len()], views, seed, batch, epoch: None }
     }
-    /// Views of later frames open one after another: `opens` tells the iteration from which those after a share of the time may be drawn, `time_norm` the time of
-    /// a view.
+    /// Views of later frames open one after another: `opens` tells the iteration from which those after a share of the time may be drawn, `time_norm` the time
+    /// of a view.
     pub fn with_ramp(mut self, opens: impl Fn(f64) -> f64, time_norm: impl Fn(usize) -> f32) -> Self {
         self.views.sort_by(|&a, &b| time_norm(a).total_cmp(&time_norm(b)));
         if let (Some(&first), Some(&last)) = (self.views.first(), self.views.last()) {

@@ -79,8 +79,8 @@ impl Context<'_> {
     }
 }
 
-/// Whether it is looked at after this iteration of the main stage: not before the share `time_ramp`, because what moves in frames that have not come in yet seems to
-/// stand still.
+/// Whether it is looked at after this iteration of the main stage: not before the share `time_ramp`, because what moves in frames that have not come in yet
+/// seems to stand still.
 fn is_due(schedule: &Schedule, time_ramp: f64) -> bool {
     SHARES.iter().any(|&share| share > time_ramp && schedule.iteration == schedule.iteration_at(share) as usize)
 }

@@ -168,8 +168,8 @@ impl Context<'_> {
         sampler.with_ramp(|share| schedule.iteration_at(share * ramp), |view| self.job.scene.views[view].time_norm)
     }
 
-    /// The share of the main stage in which frames come in one after another, from the first on. 0 where the canonical space is not the first frame: only that can be
-    /// left frame by frame.
+    /// The share of the main stage in which frames come in one after another, from the first on. 0 where the canonical space is not the first frame: only that
+    /// can be left frame by frame.
     pub(super) fn time_ramp(&self) -> f64 {
         let all_at_once = self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len();
         if all_at_once { 0.0 } else { self.job.config.train.time_ramp }
@@ -237,8 +237,8 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// `result`. Where it says that an image cannot be read, the checkpoint is written before, as an interruption does, unless nothing was learned yet. The run's own
-    /// error counts, whatever becomes of it.
+    /// `result`. Where it says that an image cannot be read, the checkpoint is written before, as an interruption does, unless nothing was learned yet. The
+    /// run's own error counts, whatever becomes of it.
     pub(super) fn saved_before_error<T>(&self, result: Result<T>, state: &mut TrainState) -> Result<T> {
         let learned = state.iteration > 0 || (state.stage > Stage::Coarse && self.lengths.length(Stage::Coarse) > 0);
         if let Some(path) = self.checkpoint.as_ref().filter(|_| learned && is_lost_image(&result)) {
@@ -264,8 +264,8 @@ impl Context<'_> {
         if resumable { self.saved_before_error(result, state) } else { result }
     }
 
-    /// As [`Context::saved_before_error`], in the middle of an iteration: the checkpoint is that of the state that `watchdog` remembers, where the log was `log`, unless
-    /// the one on disk, of the iteration `saved`, is newer.
+    /// As [`Context::saved_before_error`], in the middle of an iteration: the checkpoint is that of the state that `watchdog` remembers, where the log was
+    /// `log`, unless the one on disk, of the iteration `saved`, is newer.
     fn good_saved_before_error<T>(&self, result: Result<T>, watchdog: &Watchdog, (log, saved): (LogRecord, usize), state: &mut TrainState) -> Result<T> {
         if !is_lost_image(&result) || watchdog.return_to_good(self, state).is_err() {
             return result;

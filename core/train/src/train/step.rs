@@ -47,8 +47,8 @@ struct Rendered<'a> {
 }
 
 impl Context<'_> {
-    /// One iteration on the views of `batch`. Losses and offsets are looked at where they are logged and where `check` asks for it, gradients where `check` does;
-    /// what is not finite is returned, and the parameters are then as they were or unfit for use.
+    /// One iteration on the views of `batch`. Losses and offsets are looked at where they are logged and where `check` asks for it, gradients where `check`
+    /// does; what is not finite is returned, and the parameters are then as they were or unfit for use.
     pub(crate) fn photometric_step(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], check: bool, log: &mut Log) -> Result<Option<Trouble>> {
         // Iterations that wait for the device anyway need no capacity; in fine-tuning weights would be rounded twice.
         let count = check || log.due(schedule.iteration) || state.rounded.is_some();
@@ -59,8 +59,8 @@ impl Context<'_> {
         Ok(if let Outcome::Trouble(trouble) = outcome { Some(trouble) } else { None })
     }
 
-    /// One attempt at [`Context::photometric_step`]. With `count`, pairs are counted before a view is drawn. Without, there may be more than the capacity; parameters
-    /// and statistics are then as they were.
+    /// One attempt at [`Context::photometric_step`]. With `count`, pairs are counted before a view is drawn. Without, there may be more than the capacity;
+    /// parameters and statistics are then as they were.
     fn attempt(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], check: bool, count: bool, log: &mut Log) -> Result<Outcome> {
         let train = &self.job.config.train;
         let scene = self.pyramid.at(schedule.image_scale);

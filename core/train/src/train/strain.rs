@@ -1,5 +1,5 @@
-//! Strain: neighbouring Gaussians should keep their distance while they move. Normalised by the canonical distance, as in "Incoherent Deformation"
-//! (arXiv 2604.16747), where the plain difference of distances gained nothing. Rotations and translations cost nothing. Unlike there, the penalty is bounded: with
+//! Strain: neighbouring Gaussians should keep their distance while they move. Normalised by the canonical distance, as in "Incoherent Deformation" (arXiv
+//! 2604.16747), where the plain difference of distances gained nothing. Rotations and translations cost nothing. Unlike there, the penalty is bounded: with
 //! squares alone, two things that are neighbours in the canonical space and part later held each other.
 
 use crate::knn::nearest;
@@ -25,8 +25,9 @@ pub struct Neighbours {
     lists: Option<Lists>,
 }
 
-/// The neighbours of each of M Gaussians, `most` of them; whoever has fewer has itself instead, with a weight of 0. Everybody is among the neighbours of its neighbours,
-/// so that the gradient of a Gaussian is a sum over its own list: nothing is scattered, which burn does with one thread per column on graphics cards.
+/// The neighbours of each of M Gaussians, `most` of them; whoever has fewer has itself instead, with a weight of 0. Everybody is among the neighbours of its
+/// neighbours, so that the gradient of a Gaussian is a sum over its own list: nothing is scattered, which burn does with one thread per column on graphics
+/// cards.
 #[derive(Clone, Debug)]
 struct Lists {
     most: usize,
@@ -119,9 +120,8 @@ impl Neighbours {
     pub fn means(&self) -> &[f32] {
         &self.means
     }
-    /// Mean over the pairs of s^2 / (1 + s^2), with the change s of their distance as a share of the canonical one: squared where it is small, bounded where neighbours
-    /// belong to things that part (Geman and McClure's function). `offsets` are those of the centres `[M,3]`.
-    /// `None` without pairs.
+    /// Mean over the pairs of s^2 / (1 + s^2), with the change s of their distance as a share of the canonical one: squared where it is small, bounded where
+    /// neighbours belong to things that part (Geman and McClure's function). `offsets` are those of the centres `[M,3]`. `None` without pairs.
     pub fn strain(&self, offsets: Tensor<2>) -> Option<Tensor<1>> {
         let Lists { most, rows, directions, inverse, weights, slopes } = self.lists.as_ref()?;
         let own = offsets.clone().inner();

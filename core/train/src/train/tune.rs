@@ -31,8 +31,8 @@ const PROBES: usize = 8;
 /// Views per iteration. With one, training loses more than rounding.
 const BATCH: usize = 4;
 /// Largest learning rate in quantisation steps, of Gaussians and of weights whose codec states its steps, of a training of so many iterations: larger ones make
-/// values noisy, which costs bytes; half of it does not make up for the other steps of each round. Shorter trainings have larger ones, so that a random walk goes as
-/// far.
+/// values noisy, which costs bytes; half of it does not make up for the other steps of each round. Shorter trainings have larger ones, so that a random walk
+/// goes as far.
 const RATE: f64 = 0.02;
 const RATE_ITERATIONS: f64 = 200.0;
 /// Largest learning rate of weights without steps as a share of that in the middle of a main stage; ten times as much costs 0.4 dB.
@@ -279,7 +279,8 @@ impl TuneModel for Tuner<'_> {
         self.with_state(from, tuning.seed, |context, state| {
             let mut fixed = Fixed { steps: columns(&tuning.rounding.steps(&from.gaussians)?, device), size: BTreeMap::new(), weights: None, rate: 0.0 };
             let lost = self.mean_error(context, state, &tuning.rounding.round(&from.gaussians)?)? - self.mean_error(context, state, &from.gaussians)?;
-            // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its square.
+            // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its
+            // square.
             let per_bit = tuning.size_weight * 2.0 * std::f64::consts::LN_2 * lost.max(0.0) / tuning.bits_per_octave;
             let mut sampler = Sampler::new(self.job.scene.split(Split::Train), tuning.seed.child("views"), BATCH);
             let extent = self.job.scene.extent();

@@ -1,10 +1,10 @@
 //! Finds values that are not finite at their source, goes back to the last good state, and lowers the learning rate of what caused them.
 //!
 //! - Every 100 iterations, in the last one of a stage, and before a checkpoint is written, loss, offsets, gradients and all parameters are looked at; loss and
-//!   offsets also whenever the loss is logged. What is sound every 100 iterations is remembered, and nothing else: where the run goes back to does not depend on
-//!   when it writes checkpoints and logs.
-//! - Where something is not finite, the run goes back and repeats the iterations with a check of every loss, gradient and parameter, so that the first broken value
-//!   is found. Iterations depend on seeds alone, so they repeat exactly, and it is the same value whenever the trouble was noticed.
+//!   offsets also whenever the loss is logged. What is sound every 100 iterations is remembered, and nothing else: where the run goes back to does not depend
+//!   on when it writes checkpoints and logs.
+//! - Where something is not finite, the run goes back and repeats the iterations with a check of every loss, gradient and parameter, so that the first broken
+//!   value is found. Iterations depend on seeds alone, so they repeat exactly, and it is the same value whenever the trouble was noticed.
 //! - The part that it belongs to, or else the part that grew most since the good state, learns a quarter as fast from then on.
 //! - After a few attempts the run ends with an error that names the source.
 //!
@@ -179,16 +179,16 @@ impl Watchdog {
     pub fn new(state: &TrainState) -> Self {
         Self { good: Good::of(state), attempts: state.record.attempts }
     }
-    /// Whether every value of an iteration of a stage of `length` is to be checked: where a source is looked for, and where the state may be gone back to or is about
-    /// to be written, which `saves` says. A loss that is not finite leaves parameters finite, because optimizers skip such gradients.
+    /// Whether every value of an iteration of a stage of `length` is to be checked: where a source is looked for, and where the state may be gone back to or is
+    /// about to be written, which `saves` says. A loss that is not finite leaves parameters finite, because optimizers skip such gradients.
     pub fn checks(&self, iteration: usize, length: usize, saves: bool) -> bool {
         self.looks_for_source(iteration) || due(iteration, length) || saves
     }
     fn looks_for_source(&self, iteration: usize) -> bool {
         iteration <= self.attempts.checked_until
     }
-    /// After an iteration of `length`: looks at the parameters where it is time for it or where the state is about to be written, which `saves` says, and goes back
-    /// where `trouble` was found before or is found now. [`Watchdog::remember`] comes after what else belongs to the iteration.
+    /// After an iteration of `length`: looks at the parameters where it is time for it or where the state is about to be written, which `saves` says, and goes
+    /// back where `trouble` was found before or is found now. [`Watchdog::remember`] comes after what else belongs to the iteration.
     ///
     /// # Errors
     /// [`Error::Backend`] that names the source, after too many attempts.

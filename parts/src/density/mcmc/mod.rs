@@ -1,7 +1,7 @@
 //! A budget of Gaussians that is distributed by what images need (3DGS-MCMC, with growth by score and halves along the longest axis as in ImprovedGS).
 //!
-//! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves of a
-//! split together draw nearly what the whole drew, so that a round costs little.
+//! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves
+//! of a split together draw nearly what the whole drew, so that a round costs little.
 //!
 //! With `decay`, opacities fall wherever a view shows a Gaussian. Those that images need recover; the others fade and are removed.
 //!

@@ -1,5 +1,5 @@
-//! `relocate`: density control after 3DGS-MCMC (Kheradmand et al. 2024). Faded Gaussians are moved onto visible ones, their number grows to a cap, and noise lets
-//! faint ones explore.
+//! `relocate`: density control after 3DGS-MCMC (Kheradmand et al. 2024). Faded Gaussians are moved onto visible ones, their number grows to a cap, and noise
+//! lets faint ones explore.
 
 use cc4dgs_core::burn::tensor::{Device, Tensor, TensorData, activation::sigmoid};
 use cc4dgs_core::gaussians::to_vec;

@@ -1,7 +1,7 @@
 //! Videos that give fewer images than they have packets, or in another order: no image may be taken for that of another time. Skipped with a note where the
 //! ffmpeg command is missing.
 
-use super::videos::*;
+use super::recordings::*;
 use cc4dgs_core::{Scene, SceneOptions};
 use std::path::Path;
 use std::process::Command;

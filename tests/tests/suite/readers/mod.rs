@@ -14,6 +14,7 @@ mod hostile;
 mod invariance;
 mod procedural;
 mod real;
+mod recordings;
 mod rigs;
 mod selection;
 mod videos;

@@ -200,8 +200,8 @@ impl Program {
     pub fn layout_on(&self, like: &CubeTensor, input: usize, rows: usize) -> Option<Layout> {
         self.layout(input, rows, shared_bytes(&like.client))
     }
-    /// Runs all steps on these rows of the inputs; `given` is what [`Step::Load`] reads. Indices into `out` count from the first of these rows, those into `given`
-    /// from row 0.
+    /// Runs all steps on these rows of the inputs; `given` is what [`Step::Load`] reads. Indices into `out` count from the first of these rows, those into
+    /// `given` from row 0.
     pub fn run(&self, layout: Layout, input: Input, weights: &CubeTensor, given: &CubeTensor, out: &CubeTensor, rows: &Range<usize>) {
         if rows.is_empty() {
             return;

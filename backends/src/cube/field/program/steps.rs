@@ -142,8 +142,8 @@ fn stage(
     }
 }
 
-/// A thread computes a block of rows and, `across` apart, a few columns. Inputs and weights go through shared memory in vectors of four, chunk by chunk: a thread does
-/// 256 multiplications for 16 loads.
+/// A thread computes a block of rows and, `across` apart, a few columns. Inputs and weights go through shared memory in vectors of four, chunk by chunk: a
+/// thread does 256 multiplications for 16 loads.
 #[cube]
 fn multiply(
     tiles: &mut Shared<[f32]>,

@@ -27,7 +27,8 @@ const CENTRES: usize = 48;
 /// - a deformer that declares `starts-as-identity` moves nothing initially, a static one never does;
 /// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer; a regularizer has a
 ///   gradient for every array that it depends on;
-/// - offsets depend on features, weights, progress and time alone, whatever was asked in between, and those of a Gaussian not on which others are asked about with it;
+/// - offsets depend on features, weights, progress and time alone, whatever was asked in between, and those of a Gaussian not on which others are asked about
+///   with it;
 /// - several times at once give the offsets of each; packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
 /// - `start_from` changes nothing but values of weights, whatever the number of Gaussians, and stored models are opened without it;
 /// - what `simplified` returns can be built again from its settings, and moves Gaussians in nearly the same way;

@@ -95,7 +95,8 @@ impl Suite<'_> {
         let [screen, absolute, camera] = [0, 1, 2].map(|k: usize| std::mem::take(&mut values[k]));
         Ok(Ok(Probed { screen, absolute, camera }))
     }
-    /// Moving the principal point moves only the projected centres. So for one Gaussian, the finite difference by the principal point is the gradient of the centre.
+    /// Moving the principal point moves only the projected centres. So for one Gaussian, the finite difference by the principal point is the gradient of the
+    /// centre.
     pub(super) fn screen_probes_are_slopes(&self) -> Result<Option<String>> {
         let (host, camera) = (cloud(COUNT), camera());
         for index in 0..4 {

@@ -22,8 +22,8 @@ pub(super) fn kept(plugin: &ReaderPlugin, folder: &Path) -> Result<Vec<String>> 
     Ok(vec![found])
 }
 
-/// Whether the reader cannot open `folder` without what its files of [`LEAST_INDEX`] bytes or more hold that are no images. Others, such as a README, it need not
-/// read.
+/// Whether the reader cannot open `folder` without what its files of [`LEAST_INDEX`] bytes or more hold that are no images. Others, such as a README, it need
+/// not read.
 fn needs_index(plugin: &ReaderPlugin, folder: &Path) -> Result<bool> {
     let (copy, mut copied) = (temporary()?, Vec::new());
     let target = copy.path().join("dataset");

@@ -196,8 +196,8 @@ fn reconstruct(scene: &Scene, set: &WorkSet, seed: Seed) -> Fused {
     all
 }
 
-/// How many of the `available` points of each kind are taken: its share of `count`, the first kind what the others leave, and whatever is left over to those that
-/// have more.
+/// How many of the `available` points of each kind are taken: its share of `count`, the first kind what the others leave, and whatever is left over to those
+/// that have more.
 fn share_out(available: [usize; 4], wanted: [f64; 4], count: usize) -> [usize; 4] {
     let mut taken = [0; 4];
     for kind in [2, 1, 3, 0] {
@@ -211,8 +211,8 @@ fn share_out(available: [usize; 4], wanted: [f64; 4], count: usize) -> [usize; 4
     taken
 }
 
-/// One candidate, the most confident, per cube, in random order. Cubes have the edge `cell` up to the distance `far`, and twice that from every doubling of it on:
-/// images resolve no more there.
+/// One candidate, the most confident, per cube, in random order. Cubes have the edge `cell` up to the distance `far`, and twice that from every doubling of it
+/// on: images resolve no more there.
 fn thin(candidates: Vec<Candidate>, cell: f32, far: f32, seed: Seed) -> Vec<Candidate> {
     let mut best: HashMap<(i32, [i32; 3]), usize> = HashMap::new();
     for (i, c) in candidates.iter().enumerate() {

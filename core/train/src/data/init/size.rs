@@ -52,8 +52,8 @@ fn mean(host: &HostGaussians, row: usize) -> DVec3 {
     DVec3::from(std::array::from_fn(|k| f64::from(host.means[3 * row + k])))
 }
 
-/// Caps the scales of first Gaussians of a whole scene at 4 % of the width of the image in the nearest training camera that sees each (in the nearest camera, if
-/// none does; more if there are fewer than 10,000 Gaussians), and returns how many were larger.
+/// Caps the scales of first Gaussians of a whole scene at 4 % of the width of the image in the nearest training camera that sees each (in the nearest camera,
+/// if none does; more if there are fewer than 10,000 Gaussians), and returns how many were larger.
 pub fn limit_sizes(scene: &Scene, host: &mut HostGaussians) -> usize {
     limit_sizes_to(scene, host, MAX_WIDTH_SHARE.max(COVER / (host.len().max(1) as f64).sqrt()))
 }
@@ -78,8 +78,8 @@ pub(crate) fn limit_sizes_to(scene: &Scene, host: &mut HostGaussians, share: f64
     capped
 }
 
-/// Lowers the opacities of the Gaussians `rows` together until light that crosses them is dimmed by a factor of e² on average, or they are 0.02; returns the new
-/// opacity if they were lowered. Their opacities must be equal.
+/// Lowers the opacities of the Gaussians `rows` together until light that crosses them is dimmed by a factor of e² on average, or they are 0.02; returns the
+/// new opacity if they were lowered. Their opacities must be equal.
 pub fn limit_opacities(scene: &Scene, host: &mut HostGaussians, rows: Range<usize>) -> Option<f32> {
     let eyes = eyes(scene);
     let first = *host.opacity_logits.get(rows.start)?;

@@ -35,8 +35,8 @@ const MESSAGES: u64 = 1 << 16;
 /// Whether [`answers_interrupts`] was called.
 static ANSWERS_INTERRUPTS: AtomicBool = AtomicBool::new(false);
 
-/// Says that this program goes on after Ctrl-C, to stop at a safe point: Ctrl-C then does not reach ffmpeg, and a video that is being decoded is decoded to its end.
-/// Without this call Ctrl-C ends ffmpeg together with the program. Else ffmpeg would go on alone, and its frames would stay in the cache without a use.
+/// Says that this program goes on after Ctrl-C, to stop at a safe point: Ctrl-C then does not reach ffmpeg, and a video that is being decoded is decoded to its
+/// end. Without this call Ctrl-C ends ffmpeg together with the program. Else ffmpeg would go on alone, and its frames would stay in the cache without a use.
 pub fn answers_interrupts() {
     ANSWERS_INTERRUPTS.store(true, Ordering::Relaxed);
 }

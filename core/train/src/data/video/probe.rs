@@ -261,9 +261,11 @@ fn shown(packets: &[Packet]) -> impl Iterator<Item = &Packet> {
     packets.iter().filter(|packet| !packet.flags.contains('D'))
 }
 
-/// Whether packets come before the first key frame, or have no time beside others that have one: in a video that was cut without decoding it, those cannot be decoded.
+/// Whether packets come before the first key frame, or have no time beside others that have one: in a video that was cut without decoding it, those cannot be
+/// decoded.
 ///
-/// Some containers (MPEG program streams) state times of presentation for some frames only, all through the video, and of decoding for all: none is missing then.
+/// Some containers (MPEG program streams) state times of presentation for some frames only, all through the video, and of decoding for all: none is missing
+/// then.
 fn has_leading(packets: &[Packet]) -> bool {
     let mut rest = shown(packets).skip_while(|packet| !packet.flags.contains('K'));
     let Some(key) = rest.next().and_then(|packet| seconds(&packet.pts_time)) else { return false };

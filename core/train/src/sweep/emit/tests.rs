@@ -250,8 +250,8 @@ fn a_variable_that_is_not_unicode_is_not_called_absent() {
     assert!(message.contains("CC4DGS_DATA is not Unicode here") && message.contains("part") && !message.contains("not set"), "{message}");
 }
 
-/// The script as bash reads it, with a program that answers with its arguments, a variable and an exit code. Slurm's notice is a signal to the script alone; where
-/// a task is cancelled or preempted, the program gets one, too.
+/// The script as bash reads it, with a program that answers with its arguments, a variable and an exit code. Slurm's notice is a signal to the script alone;
+/// where a task is cancelled or preempted, the program gets one, too.
 #[cfg(unix)]
 #[test]
 fn the_slurm_script_is_bash_and_requeues_what_was_asked_to_stop_before_its_limit() {

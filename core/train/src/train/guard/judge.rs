@@ -130,8 +130,8 @@ impl Context<'_> {
         Ok((kept, measured))
     }
 
-    /// Remembers what an opacity reset must come back to. False where it is to be left out: one of the stage was undone, the last one is not back, training views
-    /// have no PSNR, or the time is too short to judge it.
+    /// Remembers what an opacity reset must come back to. False where it is to be left out: one of the stage was undone, the last one is not back, training
+    /// views have no PSNR, or the time is too short to judge it.
     fn begin_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<bool> {
         if state.guard.resets_off || schedule.left() < recovery(schedule) {
             return Ok(false);
@@ -226,7 +226,8 @@ fn without_reset(plan: &DensityPlan) -> DensityPlan {
     other
 }
 
-/// Resets the rows that were restored, from `first` on, as the control resets its own: to at most the largest logit that it sets. `logits` are those of old rows.
+/// Resets the rows that were restored, from `first` on, as the control resets its own: to at most the largest logit that it sets. `logits` are those of old
+/// rows.
 fn lower_restored(plan: &mut DensityPlan, first: usize, logits: &[f32]) {
     let set = plan.values().iter().filter(|set| set.attribute == OPACITIES).flat_map(|set| &set.values);
     let highest = set.copied().fold(f32::NEG_INFINITY, f32::max);

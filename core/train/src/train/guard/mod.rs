@@ -1,12 +1,13 @@
 //! Keeps density control from destroying what is already fitted, whatever the control.
 //!
 //! - Gaussians with values that are not finite always go. Of the others:
-//! - Nothing is removed before the cameras of the stage had two passes to fit it, or a sixth of the stage: not at its beginning, and no Gaussian that is younger.
+//! - Nothing is removed before the cameras of the stage had two passes to fit it, or a sixth of the stage: not at its beginning, and no Gaussian that is
+//!   younger.
 //! - A Gaussian that was drawn in fewer than 16 views stays longer, up to a sixth of the stage.
 //! - One round removes at most a quarter of the Gaussians.
 //! - A removal that costs more than 0.3 dB on training views at once is halved, the most opaque Gaussians being kept, and then left out.
-//! - It is measured on images of the size and of the frames that are trained on at the time. When images grow or frames come in, scores before and after cannot be
-//!   compared: what was lost before counts no more.
+//! - It is measured on images of the size and of the frames that are trained on at the time. When images grow or frames come in, scores before and after cannot
+//!   be compared: what was lost before counts no more.
 //! - After a removal that was measured, what training views lost must be back within a stated number of iterations, to within 0.3 dB. Until then removals
 //!   together may cost no more than one; where the PSNR is lower, the next ones are put off. What is not back after three times as long has other causes.
 //! - Where a measured removal made the Gaussians fewer, growth does not replace them until training views have the PSNR of before it, or that time is over
@@ -231,7 +232,8 @@ impl Guard {
         let age = schedule.iteration.saturating_sub(self.born[row] as usize);
         age < patience || (age < most && self.drawn[row] < VIEWS)
     }
-    /// Whether the next removal may go, where training views have `psnr_db` now. Within the time that the last one has to come back, losses count from before it.
+    /// Whether the next removal may go, where training views have `psnr_db` now. Within the time that the last one has to come back, losses count from before
+    /// it.
     fn standing(&self, psnr_db: f32, schedule: &Schedule) -> Standing {
         let now = Removal { iteration: schedule.iteration, psnr_db, reported: false };
         let Some(last) = &self.removal else { return Standing::Back(now) };

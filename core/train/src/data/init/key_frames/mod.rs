@@ -1,10 +1,10 @@
 //! Points of several key frames, each with a life and a velocity (FreeTimeGS starts so): what moves is found where it is at each of them, instead of being
 //! followed from the first frame.
 //!
-//! Where several cameras see each frame, the images of a key frame give points as those of the first frame do. How long a point is there is judged by its colour:
-//! it is alive at another key frame while most of the images that show it have the same colour there. What the median images over time show stands still:
-//! it is alive where something passes before it, too. The velocity is the one with which a point is found again at the neighbouring key frames, searched at
-//! random and handed on between neighbours as in PatchMatch (Barnes et al. 2009).
+//! Where several cameras see each frame, the images of a key frame give points as those of the first frame do. How long a point is there is judged by its
+//! colour: it is alive at another key frame while most of the images that show it have the same colour there. What the median images over time show stands
+//! still: it is alive where something passes before it, too. The velocity is the one with which a point is found again at the neighbouring key frames, searched
+//! at random and handed on between neighbours as in PatchMatch (Barnes et al. 2009).
 
 mod images;
 mod motion;
@@ -65,10 +65,10 @@ pub(crate) struct KeyFrames {
 }
 
 impl KeyFrames {
-    /// Every `every`-th frame of `scene` (at least 1), with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height)
-    /// says so. Frames that lack an image of a camera are left out. Key frames are in the order of their times. Where the scene has none, the reason and what to do:
-    /// cameras do not share times, or fewer than two of these frames, the first among them, have images of all cameras, or frame 0 is not the earliest.
-    /// Differences up to `noise`, 0..1, are none. Each thread holds one whole image at a time; those that are kept are small.
+    /// Every `every`-th frame of `scene` (at least 1), with points of the pixels for which `moves` (camera of the scene, share of the width, share of the
+    /// height) says so. Frames that lack an image of a camera are left out. Key frames are in the order of their times. Where the scene has none, the reason
+    /// and what to do: cameras do not share times, or fewer than two of these frames, the first among them, have images of all cameras, or frame 0 is not the
+    /// earliest. Differences up to `noise`, 0..1, are none. Each thread holds one whole image at a time; those that are kept are small.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
@@ -240,8 +240,8 @@ fn candidates(set: &WorkSet, seed: Seed) -> Vec<Candidate> {
     thin(fused.matched, set.cell_size(), far, seed.child("matched"))
 }
 
-/// The first and the last of `count` indices up to which `there` reaches from `from`, over gaps of up to `hidden` each; a gap at either end is one, too. Nothing
-/// is asked beyond a longer gap.
+/// The first and the last of `count` indices up to which `there` reaches from `from`, over gaps of up to `hidden` each; a gap at either end is one, too.
+/// Nothing is asked beyond a longer gap.
 fn reach(there: impl Fn(usize) -> bool, count: usize, from: usize, hidden: usize) -> [usize; 2] {
     let along = |indices: &mut dyn Iterator<Item = usize>| {
         let (mut end, mut last) = (from, from);
