@@ -14,6 +14,9 @@ use glam::DVec3;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+/// Distance up to which two centres are those of one camera, as a share of the size of the rig.
+const SAME_CENTER: f64 = 1e-3;
+
 /// An image record.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ColmapImage {
@@ -174,10 +177,29 @@ pub(crate) fn points_in_same_world(path: &Path, cameras: &[RawCamera], limits: &
             Some((stem, center(&from_quaternion(i.rotation, i.translation).ok()?)))
         })
         .collect();
+    let (own, spread) = rig(cameras);
+    let agree = cameras.iter().zip(&own).all(|(c, o)| centers.get(c.name.as_str()).is_some_and(|p| (*p - *o).length() <= SAME_CENTER * spread));
+    Ok((agree && spread > 0.0).then_some(model.points))
+}
+
+/// Whether at least half of the images of the model in `folder`, whatever their names, were taken where one of `cameras` stands, to a thousandth of the rig.
+/// `None` where there is no sound model with images, or where all cameras stand at one point.
+pub(super) fn stands_with(folder: &Path, cameras: &[RawCamera], limits: &Limits) -> Option<bool> {
+    if !["bin", "txt"].iter().any(|extension| is_complete(folder, extension)) {
+        return None;
+    }
+    let images = read_images(folder, limits).ok().filter(|images| !images.is_empty())?;
+    let (own, spread) = rig(cameras);
+    let is_own = |p: DVec3| own.iter().any(|o| (p - *o).length() <= SAME_CENTER * spread);
+    let agree = images.iter().filter(|i| from_quaternion(i.rotation, i.translation).is_ok_and(|pose| is_own(center(&pose)))).count();
+    (spread > 0.0).then_some(2 * agree >= images.len())
+}
+
+/// The centres of `cameras` in the world, and the largest distance of two of them.
+fn rig(cameras: &[RawCamera]) -> (Vec<DVec3>, f64) {
     let own: Vec<DVec3> = cameras.iter().map(|c| center(&c.world_to_camera)).collect();
     let spread = own.iter().flat_map(|a| own.iter().map(move |b| (*a - *b).length())).fold(0.0, f64::max);
-    let agree = cameras.iter().zip(&own).all(|(c, o)| centers.get(c.name.as_str()).is_some_and(|p| (*p - *o).length() <= 1e-3 * spread));
-    Ok((agree && spread > 0.0).then_some(model.points))
+    (own, spread)
 }
 
 fn center(m: &Matrix4) -> DVec3 {

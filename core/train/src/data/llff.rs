@@ -1,9 +1,11 @@
 //! N3DV ("dynerf") and LLFF scenes: `poses_bounds.npy` with one row per camera, and per camera a video, a folder of frames, or one image.
+//! First points come from a dense cloud or a COLMAP model beside it.
 
 use super::camera_box::frustum_box;
+use super::dense_clouds::first_points;
 use super::nerfstudio::{LEAST_HELD_OUT, NOTHING_HELD_OUT};
 use super::npy::read_npy;
-use super::{colmap, video};
+use super::video;
 use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_bytes};
 use cc4dgs_core::reader::pose::world_to_camera;
 use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural};
@@ -83,11 +85,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             scene.views.extend(image.map(|image| RawView { camera: index, frame, time: None, split, image }));
         }
     }
-    match colmap::points_in_same_world(path, &scene.cameras, limits) {
-        Ok(points) => scene.points = points,
-        // The cameras do not need it.
-        Err(error) => scene.warnings.push(format!("the points of the COLMAP model beside poses_bounds.npy are not used: {error}")),
-    }
+    scene.points = first_points(path, "poses_bounds.npy", &scene.cameras, limits, &mut scene.warnings)?;
     scene.init_box = frustum_box(&scene.cameras, &depths);
     Ok(scene)
 }

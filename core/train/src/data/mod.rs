@@ -12,6 +12,7 @@ mod colmap_binary;
 mod colmap_camera;
 mod colmap_text;
 mod colmap_videos;
+mod dense_clouds;
 mod fixed_cameras;
 mod focus;
 mod frames;

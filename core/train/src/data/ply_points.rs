@@ -183,8 +183,17 @@ impl Header {
     }
 }
 
-/// The vertices of the PLY `bytes` with their colours; grey where it has none. `object` names the file in errors.
+/// The vertices of the PLY `bytes`, one or more, with their colours; grey where it has none. `object` names the file in errors.
 pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<RawPoints> {
+    let cloud = points_or_none(object, bytes, limits)?;
+    if cloud.positions.is_empty() {
+        return Err(damaged(object, "it has no vertices".into()));
+    }
+    Ok(cloud)
+}
+
+/// As [`points`], for a file that may have no vertices.
+pub(crate) fn points_or_none(object: &str, bytes: &[u8], limits: &Limits) -> Result<RawPoints> {
     let header = Header::parse(object, bytes, limits)?;
     let xyz = header.columns(["x", "y", "z"]).ok_or_else(|| damaged(object, "its vertices lack x, y or z".into()))?;
     let colour = header.columns(["red", "green", "blue"]);
@@ -202,9 +211,6 @@ pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<RawP
         cloud.colors.push(colour.map_or([GREY; 3], |columns| columns.map(intensity)));
         Ok(())
     })?;
-    if cloud.positions.is_empty() {
-        return Err(damaged(object, "it has no vertices".into()));
-    }
     Ok(cloud)
 }
 

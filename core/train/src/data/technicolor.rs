@@ -1,5 +1,7 @@
 //! Technicolor light-field videos as E-D3DGS uses them: a 4x4 rig, undistorted images or smaller copies of them, `cameras_parameters.txt`.
+//! First points come from a dense cloud or a COLMAP model beside it.
 
+use super::dense_clouds::first_points;
 use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_text};
 use cc4dgs_core::reader::pose::from_quaternion;
 use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory, plural};
@@ -94,6 +96,7 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         let frame = frames.partition_point(|&f| f < frame);
         scene.views.push(RawView { camera: camera as usize, frame, time: None, split, image: ImageSource::file(path) });
     }
+    scene.points = first_points(path, "cameras_parameters.txt", &scene.cameras, limits, &mut scene.warnings)?;
     if scene.views.iter().all(|view| view.split != Split::Test) {
         scene.warnings.push(format!("there is no image of camera {TEST_CAMERA}; nothing is held out"));
     }

@@ -199,6 +199,18 @@ pub fn write_llff(root: &Path) {
     (0..3).for_each(|c| write_image(&root.join(format!("images/{c}.png")), 16, 12, 0));
 }
 
+/// A PLY of red points at `positions`, as COLMAP's stereo fusion writes it.
+pub fn write_cloud(path: &Path, positions: &[[f32; 3]]) {
+    let properties: String = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"].iter().map(|p| format!("property {p}\n")).collect();
+    let mut ply = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n{properties}end_header\n", positions.len()).into_bytes();
+    for position in positions {
+        ply.extend(position.iter().flat_map(|v| v.to_le_bytes()));
+        ply.extend([255, 0, 0]);
+    }
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    std::fs::write(path, ply).unwrap();
+}
+
 /// A nerfstudio scene of `count` images.
 pub fn write_nerfstudio(root: &Path, count: usize) -> Vec<Camera> {
     let cameras = ring(count, 16, 12);

@@ -218,6 +218,21 @@ fn random_points_are_in_view_and_leave_it_open() {
 }
 
 #[test]
+fn plain_first_points_stay_as_they_are() {
+    let scene = film(&playground(), arc(12, 3.0), &(0..12).map(|i| (i, 0)).collect::<Vec<_>>());
+    let start = |plain: bool| {
+        let config = config(&["init.source=random", "init.count=3000", "init.opacity=0.5", "train.sh_degree=1", &format!("init.plain={plain}")]);
+        initialise(&scene, &config, Seed::root(2), &Silent).unwrap()
+    };
+    let (plain, limited) = (start(true), start(false));
+    assert_eq!(plain.means, limited.means);
+    let positions: Vec<[f32; 3]> = plain.means.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+    let points = PointCloud { colors: vec![[0.5; 3]; positions.len()], positions };
+    assert_eq!(plain, from_points(&points, 1, 0.5), "random points are grey, neither smaller nor fainter");
+    assert!(limited.opacity_logits != plain.opacity_logits && limited.sh_dc != plain.sh_dc);
+}
+
+#[test]
 fn only_what_covers_an_image_is_made_smaller() {
     let mut scene = film(&playground(), arc(6, 1.0), &(0..6).map(|i| (i, 0)).collect::<Vec<_>>());
     let grid: Vec<[f32; 3]> = (0..1000).map(|i| [i % 10, i / 10 % 10, i / 100].map(|k| 0.1 * (k as f32 - 4.5))).collect();
@@ -231,4 +246,6 @@ fn only_what_covers_an_image_is_made_smaller() {
     let (plain, capped) = (from_points(&points, 2, 0.1), start(&scene));
     assert_eq!(plain.log_scales[..3000], capped.log_scales[..3000]);
     assert!(plain.log_scales[3000] > capped.log_scales[3000] + 1.0, "{} {}", plain.log_scales[3000], capped.log_scales[3000]);
+    let config = config(&["init.source=points", "train.sh_degree=2", "init.plain=true"]);
+    assert_eq!(initialise(&scene, &config, Seed::root(0), &Silent).unwrap(), plain);
 }

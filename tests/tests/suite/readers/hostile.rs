@@ -90,13 +90,13 @@ fn nerfstudio_with_points(root: &Path) {
     let mut document: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
     document["ply_file_path"] = "points.ply".into();
     std::fs::write(&file, document.to_string()).unwrap();
-    let properties: String = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"].iter().map(|p| format!("property {p}\n")).collect();
-    let mut ply = format!("ply\nformat binary_little_endian 1.0\nelement vertex 3\n{properties}end_header\n").into_bytes();
-    for i in 0..3u8 {
-        ply.extend([f32::from(i); 3].iter().flat_map(|v| v.to_le_bytes()));
-        ply.extend([i; 3]);
-    }
-    std::fs::write(root.join("points.ply"), ply).unwrap();
+    write_cloud(&root.join("points.ply"), &[[0.0; 3], [1.0; 3], [2.0; 3]]);
+}
+
+/// A LLFF scene with a dense cloud of three points.
+fn llff_with_cloud(root: &Path) {
+    write_llff(root);
+    write_cloud(&root.join("points3D_downsample2.ply"), &[[0.0; 3], [0.1; 3], [0.2; 3]]);
 }
 
 #[test]
@@ -106,6 +106,7 @@ fn every_cut_of_every_index_file_is_survived() {
         Victim::new(write_colmap, "sparse/0/images.bin"),
         Victim::new(write_colmap, "sparse/0/points3D.bin"),
         Victim::new(write_llff, "poses_bounds.npy"),
+        Victim::new(llff_with_cloud, "points3D_downsample2.ply"),
         Victim::new(dnerf, "transforms_train.json"),
     ];
     for victim in &victims {
@@ -220,6 +221,7 @@ damaged! {
     damaged_colmap_images: write_colmap, "sparse/0/images.bin";
     damaged_colmap_points: write_colmap, "sparse/0/points3D.bin";
     damaged_ply_points: nerfstudio_with_points, "points.ply";
+    damaged_dense_cloud: llff_with_cloud, "points3D_downsample2.ply";
     damaged_poses_bounds: write_llff, "poses_bounds.npy";
     damaged_transforms: dnerf, "transforms_train.json";
     damaged_meta: panoptic, "train_meta.json";

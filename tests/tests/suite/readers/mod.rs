@@ -1,6 +1,7 @@
 //! Dataset readers: each on a tiny scene written by the test, on untrusted bytes, and on real scenes if they are present.
 
 mod captures;
+mod clouds;
 mod colmap;
 pub mod common;
 mod conformance;
