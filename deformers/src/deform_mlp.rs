@@ -1,7 +1,7 @@
 //! The deformer of Deformable-3DGS: a network of eight layers on positionally encoded centre and time (Yang et al. 2024).
 //!
 //! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code, whose rasterizer does not normalise the
-//! sum; ours does. The last layers start at zero, so that nothing moves at first; the published ones are random.
+//! sum; ours does. The last layers start at zero, so that nothing moves at first; the published ones are random, as with `random_heads`.
 
 use crate::parts::centres::{check_time, finite};
 use crate::parts::settings::{bounded, not_negative, within};
@@ -22,6 +22,7 @@ skip = 5                 # the input is concatenated again after this many layer
 position_bands = 10      # sines and cosines of x * 2^0 ... 2^9
 time_bands = 10          # of t; the published code uses 6 on synthetic scenes
 time_network = false     # a separate network for time (256 wide, 30 outputs), as on synthetic scenes
+random_heads = false     # start the last layers at random, as published, in place of zero: the first offsets displace all Gaussians
 lr_start = 8e-4          # Adam, log-linear to lr_end
 lr_end = 1.6e-6
 "#;
@@ -40,13 +41,14 @@ struct Settings {
     position_bands: usize,
     time_bands: usize,
     time_network: bool,
+    random_heads: bool,
     lr_start: f64,
     lr_end: f64,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { width: 256, layers: 8, skip: 5, position_bands: 10, time_bands: 10, time_network: false, lr_start: 8e-4, lr_end: 1.6e-6 }
+        Self { width: 256, layers: 8, skip: 5, position_bands: 10, time_bands: 10, time_network: false, random_heads: false, lr_start: 8e-4, lr_end: 1.6e-6 }
     }
 }
 
@@ -94,7 +96,11 @@ impl DeformMlp {
         let add = |name: &str, values| parameter(format!("net.{name}"), Part::Net, 0, values, device);
         let mut last = layers("after", chain(after.input, &after.trunk));
         // Published heads are random: their first offsets move static parts of the scene, and short runs never undo it.
-        last.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(w, out)));
+        if settings.random_heads {
+            last.extend(layers("last", OUTPUTS.iter().map(|&out| (w, out)).collect()));
+        } else {
+            last.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(w, out)));
+        }
         let mut parameters = vec![add("before", layers("before", chain(input, &before.trunk))), add("after", last)];
         if time.is_some() {
             parameters.push(add("time", layers("time", chain(of_time, &TIME_WIDTHS))));

@@ -4,20 +4,22 @@
 //! vectors of neighbours similar. The published code compares every Gaussian with its 20 nearest, which it finds when the number of Gaussians changes; this one
 //! compares random pairs of neighbours of the iteration. Its time offsets per camera are omitted, because a model here has no cameras. So is a term of its
 //! loss, the sigmoid of the mean opacity logit (weight 1e-4), because a deformer does not see opacities; the loss term `opacity`, the mean of the sigmoids, is
-//! near it.
+//! near it. All layers of the published networks start as PyTorch's `nn.Linear` does, as with `random_heads`; without it the last ones start at zero, so that
+//! nothing moves at first, and the others have Glorot weights.
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
-use crate::parts::neighbours::{PATCH, neighbour_pairs};
+use crate::parts::neighbours::{PAIRS, PATCH, neighbour_pairs, spread_pairs};
 use crate::parts::settings::{bounded, not_negative, within};
+use crate::parts::vectors::{differences, spread_differences};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Seed,
-    SpatialFeatures, SpatialInput, config, inventory, ordered_sum,
+    SpatialFeatures, SpatialInput, config, inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -30,8 +32,11 @@ rows_grow = 0.125        # share of training over which the fine network's rows 
 fade_in = 0.0125         # share of training over which offsets are faded in, at most 1/6; opacity, colour and scale start five such shares later (1,000 of 80,000)
 width = 128
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
+random_heads = false     # start all layers at random, as published, in place of the last ones at zero: the first offsets displace all Gaussians
+zero_times = false       # start the table of times at zero (published for Technicolor and HyperNeRF) in place of small random numbers
 smooth_weight = 1.0      # weight of the differences between vectors of neighbours; 0 is off (published: 1, Technicolor 0.1)
 smooth_neighbours = 20   # the nearest Gaussians that count as neighbours
+smooth_pairs = 2048      # random pairs of neighbours per iteration: up to 2,048 from one region, more from all; 0: one per Gaussian (published: all pairs)
 smooth_falloff = 2000.0  # differences count exp(-smooth_falloff d^2 / 2) at distance d (published: 2000, d in units of the dataset; here in world units)
 gaussian_lr = 2.5e-3     # Adam on the vectors of Gaussians
 lr_start = 1.6e-4        # Adam on everything else, log-linear to lr_end
@@ -43,9 +48,6 @@ times_extent = true      # multiply these two rates by the extent of the cameras
 const LATER: f32 = 5.0;
 /// Largest `fade_in`: all heads are faded in when training ends.
 const MOST_FADE_IN: f32 = 1.0 / (LATER + 1.0);
-
-/// Added to squared differences of vectors: the root has no gradient at 0. As published.
-const LEAST_SQUARE: f32 = 1e-20;
 
 /// Name of the extra attribute.
 const ATTRIBUTE: &str = "embedding";
@@ -61,8 +63,11 @@ struct Settings {
     fade_in: f32,
     width: usize,
     heads: Vec<Head>,
+    random_heads: bool,
+    zero_times: bool,
     smooth_weight: f64,
     smooth_neighbours: usize,
+    smooth_pairs: usize,
     smooth_falloff: f64,
     gaussian_lr: f64,
     lr_start: f64,
@@ -81,8 +86,11 @@ impl Default for Settings {
             fade_in: 0.0125,
             width: 128,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
+            random_heads: false,
+            zero_times: false,
             smooth_weight: 1.0,
             smooth_neighbours: 20,
+            smooth_pairs: PAIRS,
             smooth_falloff: 2000.0,
             gaussian_lr: 2.5e-3,
             lr_start: 1.6e-4,
@@ -128,15 +136,18 @@ impl Embedding {
         let seed = context.seed;
         // Uniform with the standard deviation of the published normal: 0.01 / sqrt(width).
         let bound = 0.01 * 3f32.sqrt() / (settings.time_features as f32).sqrt();
-        let times = weights::uniform(seed.child("times"), settings.time_rows * settings.time_features, bound);
+        let count = settings.time_rows * settings.time_features;
+        let times = if settings.zero_times { vec![0.0; count] } else { weights::uniform(seed.child("times"), count, bound) };
         let mut parameters = vec![parameter("grid.times".into(), Part::Grid, 0, times, device)];
         for name in ["coarse", "fine"] {
             let own = seed.child(name);
-            let mut values = weights::glorot_with_bias(own.child("trunk"), input, w);
+            let layer = if settings.random_heads { weights::torch } else { weights::glorot_with_bias };
+            let mut values = layer(own.child("trunk"), input, w);
             for (i, head) in network.heads.iter().enumerate() {
-                values.extend(weights::glorot_with_bias(own.index(i as u64).child("first"), w, w));
+                let own = own.index(i as u64);
+                values.extend(layer(own.child("first"), w, w));
                 // As in `hexplane`: the published random layer displaces all Gaussians at first.
-                values.extend(weights::zeros(w, head[1]));
+                values.extend(if settings.random_heads { layer(own.child("last"), w, head[1]) } else { weights::zeros(w, head[1]) });
             }
             parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
         }
@@ -213,25 +224,21 @@ impl Deformer for Embedding {
         });
         Ok(heads::offsets(&self.settings.heads, faded.collect(), self.sh_degree))
     }
-    /// `smooth_weight` times the mean of sqrt(exp(-smooth_falloff d²) |z_i - z_j|² + 1e-20) over up to 2,048 random pairs of neighbours i and j, with the
-    /// vectors z, at the distance d; see [`neighbour_pairs`]. It reads the centres back, and its time is linear in their number.
+    /// `smooth_weight` times the mean of sqrt(exp(-smooth_falloff d²) |z_i - z_j|² + 1e-20) over random pairs of neighbours i and j, with the vectors z, at the
+    /// distance d: up to `smooth_pairs` of them; see [`neighbour_pairs`] and, for more than 2,048 and for 0, [`spread_pairs`]. It reads the centres back, and
+    /// its time is at least linear in their number.
     fn regularizer(&self, input: &SpatialInput, _time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let Some(vectors) = input.attributes.first().filter(|_| s.smooth_weight > 0.0 && input.len() > 1) else { return Ok(None) };
         let means = to_vec(input.means_world.clone(), "centres")?;
         let points: Vec<[f32; 3]> = means.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
-        let pairs = neighbour_pairs(&points, s.smooth_neighbours, self.seed.index(u64::from(progress.to_bits())));
-        let count = pairs.len();
-        if count == 0 {
-            return Ok(None);
-        }
-        let device = vectors.device();
-        let select = |rows: Vec<i64>| vectors.clone().select(0, Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &device));
-        let difference = select(pairs.iter().map(|pair| i64::from(pair.first)).collect()) - select(pairs.iter().map(|pair| i64::from(pair.second)).collect());
-        let near: Vec<f32> = pairs.iter().map(|pair| (-s.smooth_falloff * f64::from(pair.squared)).exp() as f32).collect();
-        let near = Tensor::<2>::from_data(TensorData::new(near, [count, 1]), &device);
-        let squares = (difference.clone() * difference).sum_dim(1) * near;
-        Ok(Some(ordered_sum(squares.add_scalar(LEAST_SQUARE).sqrt()).mul_scalar(s.smooth_weight / count as f64)))
+        let seed = self.seed.index(u64::from(progress.to_bits()));
+        let spread = |most: usize| spread_differences(vectors, &spread_pairs(&points, most, s.smooth_neighbours, seed), s.smooth_weight, s.smooth_falloff);
+        Ok(match s.smooth_pairs {
+            0 => spread(points.len()),
+            most if most > PAIRS => spread(most),
+            most => differences(vectors, &neighbour_pairs(&points, most, s.smooth_neighbours, seed), s.smooth_weight, s.smooth_falloff),
+        })
     }
     fn set_progress(&mut self, progress: f32) {
         self.progress = progress;
@@ -305,6 +312,39 @@ mod tests {
         assert_eq!(at(0.25), at(0.25));
         assert_ne!(at(0.25).0, at(0.5).0);
         assert!(term(&smooth(0.0), &x, &vectors, 0.5).is_none() && term(&smooth(1.0), &[0.0], &[1.0, 1.0], 0.5).is_none());
+    }
+
+    #[test]
+    fn every_gaussian_is_compared_where_pairs_are_not_limited() {
+        const COUNT: usize = 6000;
+        let x: Vec<f32> = (0..COUNT).map(|i| 1e-4 * i as f32).collect();
+        let vectors: Vec<f32> = (0..2 * COUNT).map(|i| (0.7 * i as f32).sin()).collect();
+        let compared = |smooth_pairs: usize| {
+            let mut field = smooth(1.0);
+            field.settings.smooth_pairs = smooth_pairs;
+            let (value, gradient) = term(&field, &x, &vectors, 0.5).unwrap();
+            assert_eq!(term(&field, &x, &vectors, 0.5), Some((value, gradient.clone())));
+            gradient.chunks(2).filter(|g| g.iter().any(|v| *v != 0.0)).count()
+        };
+        let found = [100, PAIRS, 4000, 0].map(compared);
+        assert!(found[0] <= 200 && found[1] <= 2 * PAIRS && found[2] > found[1] && found[3] > COUNT - COUNT / 20, "{found:?}");
+    }
+
+    #[test]
+    fn networks_and_times_start_as_the_settings_say() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let weights = |random_heads: bool, zero_times: bool| -> [Vec<f32>; 3] {
+            let settings = Settings { gaussian_features: 12, time_features: 4, width: 4, random_heads, zero_times, ..Settings::default() };
+            let field = Embedding::new(settings, &context, &Device::flex()).unwrap();
+            [0, 1, 2].map(|index: usize| to_vec(field.parameters[index].value.clone(), "weights").unwrap())
+        };
+        let largest = |values: &[f32]| values.iter().fold(0.0f32, |most, v| most.max(v.abs()));
+        let ([times, coarse, _], [zeros, random, fine]) = (weights(false, false), weights(true, true));
+        assert!(largest(&times) > 0.0 && largest(&zeros) == 0.0 && random != fine);
+        // PyTorch's bound of a layer with 16 inputs is 1/4, Glorot's with 4 outputs 0.55.
+        let trunk = 17 * 4;
+        assert!(largest(&coarse[..trunk]) > 0.3 && (0.2..=0.25).contains(&largest(&random[..trunk])));
+        assert!((0.4..=0.5).contains(&largest(&random[trunk..])) && random.len() == coarse.len());
     }
 
     #[test]

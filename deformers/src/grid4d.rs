@@ -3,7 +3,7 @@
 //! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised by
 //! the deformer's box rather than by a fixed bound per dataset, and so are the perturbations of the smoothness term. R(q) passes no gradient to the canonical
 //! centre. The published term begins when Gaussians no longer grow on N3DV, for which there is `smooth_from`. It also perturbs times on most D-NeRF scenes,
-//! which is omitted. The last layers start at zero, so that nothing moves at first; the published ones are random.
+//! which is omitted. The last layers start at zero, so that nothing moves at first; the published ones are random, as with `random_heads`.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
 use crate::parts::settings::{bounded, not_negative, within};
@@ -31,6 +31,7 @@ time_final = [32, 32, 16]    # vertices per axis of their last level (published:
 features = 2             # per level
 width = 256
 depth = 0                # hidden layers after the attention
+random_heads = false     # start the last layers at random, as published, in place of zero: the first offsets displace all Gaussians
 smooth_weight = 0.5      # weight of the squared difference of features at perturbed centres
 smooth_delta = 1e-3      # the largest perturbation per axis, as a share of the box (published: 8e-5 on N3DV, 3e-3 on D-NeRF)
 smooth_from = 0.0        # share of the main stage after which smoothness counts (published: 0.706 on N3DV, where Gaussians grow until then)
@@ -66,6 +67,7 @@ struct Settings {
     features: usize,
     width: usize,
     depth: usize,
+    random_heads: bool,
     smooth_weight: f32,
     smooth_delta: f32,
     smooth_from: f32,
@@ -88,6 +90,7 @@ impl Default for Settings {
             features: 2,
             width: 256,
             depth: 0,
+            random_heads: false,
             smooth_weight: 0.5,
             smooth_delta: 1e-3,
             smooth_from: 0.0,
@@ -163,7 +166,11 @@ impl Grid4d {
         };
         // Published heads are random: their first offsets move static parts of the scene, and short runs never undo it.
         let mut heads = layers("heads", &vec![(s.width, s.width); s.depth]);
-        heads.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(s.width, out)));
+        if s.random_heads {
+            heads.extend(layers("last", &OUTPUTS.map(|out| (s.width, out))));
+        } else {
+            heads.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(s.width, out)));
+        }
         for (name, values) in [
             ("attention", layers("attention", &[(space.width(), s.width)])),
             ("temporal", layers("temporal", &[(3 * time.width(), s.width)])),

@@ -25,6 +25,7 @@ features = 16            # per plane
 width = 128              # width of the network
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
 half_time = false        # read only the upper half of the time axis, as the published code does
+random_heads = false     # start the last layers at random, as published, in place of zero: the first offsets displace all Gaussians
 tv_space = 2e-4          # weight of the squared second differences of spatial planes
 tv_time = 1e-3           # the same for planes with time, along time
 time_one = 1e-4          # weight of the distance from 1 of planes with time
@@ -51,6 +52,7 @@ struct Settings {
     width: usize,
     heads: Vec<Head>,
     half_time: bool,
+    random_heads: bool,
     tv_space: f32,
     tv_time: f32,
     time_one: f32,
@@ -70,6 +72,7 @@ impl Default for Settings {
             width: 128,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
             half_time: false,
+            random_heads: false,
             tv_space: 2e-4,
             tv_time: 1e-3,
             time_one: 1e-4,
@@ -128,7 +131,7 @@ impl HexPlane {
             let own = seed.child("heads").index(i as u64);
             values.extend(weights::glorot_with_bias(own.child("first"), w, w));
             // The published layer is random: its first offsets displace all Gaussians, and short runs never recover.
-            values.extend(weights::zeros(w, head[1]));
+            values.extend(if settings.random_heads { weights::glorot_with_bias(own.child("last"), w, head[1]) } else { weights::zeros(w, head[1]) });
         }
         parameters.push(parameter("net".into(), Part::Net, NET, values, device));
         Ok(Self { settings, context: context.clone(), planes, network: Arc::new(network), parameters })

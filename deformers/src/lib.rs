@@ -15,8 +15,9 @@ pub mod swift4d;
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
-    use cc4dgs_core::{DeformerContext, Registry, Seed, toml};
+    use burn::tensor::{Device, Tensor};
+    use cc4dgs_core::gaussians::to_vec;
+    use cc4dgs_core::{DeformerContext, Registry, Seed, SpatialInput, toml};
 
     #[test]
     fn sizes_that_no_machine_has_are_refused_before_they_are_allocated() {
@@ -56,6 +57,36 @@ mod tests {
                 let groups = registry.build_deformer(&section, &context, &Device::flex()).unwrap().groups();
                 assert!(!groups.is_empty() && groups.iter().all(|group| group.times_extent == follows), "{kind}: {settings}");
             }
+        }
+    }
+
+    #[test]
+    fn random_heads_move_gaussians_at_first_and_change_no_other_weights() {
+        let registry = Registry::collect().unwrap();
+        let device = Device::flex();
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(1) };
+        let centres = Tensor::<2>::from_floats([[0.3, -0.2, 0.1], [-0.7, 0.4, 0.6]], &device);
+        for (kind, sizes) in [
+            ("hexplane", "resolution = 4\ntime_resolution = 4\nfeatures = 2\nwidth = 8"),
+            ("deform-mlp", "width = 8\nlayers = 3\nskip = 1"),
+            ("grid4d", "log2_rows = 6\nspace_levels = 2\nspace_final = 32\ntime_levels = 2\nwidth = 8\ndepth = 1"),
+            ("embedding", "gaussian_features = 4\ntime_features = 4\nwidth = 8"),
+        ] {
+            let start = |settings: &str| {
+                let section: toml::Table = format!("kind = '{kind}'\n{sizes}\n{settings}").parse().unwrap();
+                let built = registry.build_deformer(&section, &context, &device).unwrap();
+                let features = built.spatial(&SpatialInput::at_start(centres.clone(), built.as_ref())).unwrap().values;
+                let offsets = to_vec(built.deform(features, 0.3).unwrap().concatenated().unwrap(), "offsets").unwrap();
+                let weights: Vec<f32> = built.parameters().iter().flat_map(|p| to_vec(p.value.clone(), "weights").unwrap()).collect();
+                (offsets, weights)
+            };
+            let (plain, random) = (start(""), start("random_heads = true"));
+            assert_eq!(start("random_heads = false"), plain, "{kind}");
+            assert!(plain.0.iter().all(|v| *v == 0.0), "{kind}: {:?}", plain.0);
+            assert!(random.0.iter().all(|v| v.is_finite()) && random.0.iter().filter(|v| **v != 0.0).count() > random.0.len() / 2, "{kind}: {:?}", random.0);
+            // All layers of `embedding` start in another way.
+            let other = |(a, b): (&f32, &f32)| *a != 0.0 && a != b;
+            assert!(plain.1.len() == random.1.len() && (kind == "embedding" || !plain.1.iter().zip(&random.1).any(other)), "{kind}");
         }
     }
 

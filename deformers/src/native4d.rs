@@ -19,10 +19,12 @@ const SCHEMA: &str = "\
 duration = 0.1414        # standard deviation in time of a new Gaussian, as a share of the sequence (published: sqrt(2) of 10 s on N3DV; sqrt(s / 5) of s seconds)
 hidden_below = 0.05      # a Gaussian whose opacity factor is below this is hidden
 harmonics = 2            # number of cosines of time by which colours change (4D spherical harmonics); 0 for constant colours
+period = 1.0             # that of the first cosine, in sequences
 harmonics_every = 0.0    # cosines are used one after the other at this share of the main stage, after the degrees of colours; 0: all from the start
 time_lr = 1.6e-5         # Adam on the centre in time, times the extent of the cameras in the normalised frame (published: 1.6e-4 of seconds; 10 s on N3DV)
 duration_lr = 5e-3       # Adam on the logarithm of the duration
 velocity_lr = 1e-3       # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
+velocity_extent = true   # false: not times the extent. Published: two quaternions at 1e-3, which is a velocity at 2e-3 of world units per unit of time
 color_lr = 1.25e-4       # Adam on the cosines' coefficients
 ";
 
@@ -39,10 +41,12 @@ struct Settings {
     duration: f32,
     hidden_below: f32,
     harmonics: usize,
+    period: f32,
     harmonics_every: f32,
     time_lr: f64,
     duration_lr: f64,
     velocity_lr: f64,
+    velocity_extent: bool,
     color_lr: f64,
 }
 
@@ -52,10 +56,12 @@ impl Default for Settings {
             duration: 0.1414,
             hidden_below: 0.05,
             harmonics: 2,
+            period: 1.0,
             harmonics_every: 0.0,
             time_lr: 1.6e-5,
             duration_lr: 5e-3,
             velocity_lr: 1e-3,
+            velocity_extent: true,
             color_lr: 1.25e-4,
         }
     }
@@ -83,6 +89,9 @@ impl Native4d {
         if !(0.0..1.0).contains(&settings.hidden_below) {
             return bad("hidden_below", settings.hidden_below, "Give a factor from 0 to below 1");
         }
+        if !(settings.period > 1e-4 && settings.period < 1e4) {
+            return bad("period", settings.period, "Give a multiple of the sequence; 1 is usual");
+        }
         if !(0.0..=1.0).contains(&settings.harmonics_every) {
             return bad("harmonics_every", settings.harmonics_every, "Give a share of the main stage, such as 0.033, or 0 for all cosines from the start");
         }
@@ -100,7 +109,7 @@ impl Deformer for Native4d {
         let s = &self.settings;
         // Initial centres in time reach a tenth of the sequence beyond either end, as in the published code.
         let starts = [(0.5, 0.6), (s.duration.ln(), 0.0), (0.0, 0.0), (0.0, 0.0)];
-        let rates = [(s.time_lr, true), (s.duration_lr, false), (s.velocity_lr, true), (s.color_lr, false)];
+        let rates = [(s.time_lr, true), (s.duration_lr, false), (s.velocity_lr, s.velocity_extent), (s.color_lr, false)];
         let names = SPACE_TIME_ATTRIBUTES.map(|(name, _)| name).into_iter().chain([COLORS]);
         let all = names.zip(self.widths()).zip(starts).zip(rates);
         all.filter(|(((_, width), _), _)| *width > 0)
@@ -122,7 +131,7 @@ impl Deformer for Native4d {
         let hidden = factor.clone().lower_elem(self.settings.hidden_below.max(f32::MIN_POSITIVE).ln());
         let sh = (self.settings.harmonics > 0).then(|| {
             let width = 3 * self.basis;
-            let wave = |n: usize| part(5 + (n - 1) * width, width) * since.clone().mul_scalar(TAU * n as f32).cos();
+            let wave = |n: usize| part(5 + (n - 1) * width, width) * since.clone().mul_scalar(TAU / self.settings.period * n as f32).cos();
             let sum = (1..=self.open).map(wave).reduce(|sum, next| sum + next);
             sum.unwrap_or_else(|| Tensor::zeros([m, width], &features.device())).reshape([m, self.basis, 3])
         });
@@ -182,6 +191,13 @@ mod tests {
         // At its own time every cosine is 1. A model that is only played has all of them.
         assert_eq!([None, Some(0.01), Some(0.15), Some(0.25), Some(0.35), Some(1.0), Some(0.15)].map(&mut color), [2.0, 0.0, 0.0, 1.0, 2.0, 2.0, 0.0]);
         assert!(Native4d::new(Settings { harmonics_every: f32::NAN, ..Settings::default() }, &context).is_err());
+        // A quarter of a sequence from its own time: half of a short period, and hardly anything of a long one.
+        for (period, wanted) in [(0.5, -1.0 + 1.0), (1.0, 0.0 - 1.0), (50.0, 2.0)] {
+            let field = Native4d::new(Settings { period, ..Settings::default() }, &context).unwrap();
+            let color = to_vec(field.deform(features.clone(), 0.75).unwrap().sh.unwrap(), "colours").unwrap()[0];
+            assert!((color - wanted).abs() < 5e-3, "period {period}: {color}");
+        }
+        assert!(Native4d::new(Settings { period: 0.0, ..Settings::default() }, &context).is_err());
     }
 
     #[test]

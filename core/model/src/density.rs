@@ -144,7 +144,7 @@ impl DensityPlan {
         self.values.iter_mut().flat_map(|set| &mut set.rows).for_each(|row| *row = moved_to[*row]);
     }
     /// Starts the optimizer state of `attribute` anew in all rows. A plan that restarts `opacity_logits` is an opacity reset: the trainer leaves the reset out
-    /// where too little time is left or the last one is not back, and undoes one from which training views do not recover.
+    /// where too little time is left or the last one is not back, and undoes one from which training views do not recover, unless `train.guard` is off.
     pub fn restart(&mut self, attribute: &str) {
         self.restarted.push(attribute.into());
     }

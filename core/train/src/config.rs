@@ -1,6 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
 use crate::auto::AutoConfig;
+pub use crate::field_box::FieldBox;
 use crate::layers::Layers;
 pub use crate::train_config::{CoarseFrames, Dynamic, GaussianRates, TrainConfig};
 use cc4dgs_core::{BLUR_RANGE, Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
@@ -129,11 +130,13 @@ pub struct InitConfig {
     pub count: usize,
     /// Opacity of a new Gaussian, 0..1.
     pub opacity: f32,
+    /// Take the first points as they are: their sizes and opacities are not limited, and random ones are grey (3DGS: true).
+    pub plain: bool,
 }
 
 impl Default for InitConfig {
     fn default() -> Self {
-        Self { source: InitSource::Auto, count: 40_000, opacity: 0.1 }
+        Self { source: InitSource::Auto, count: 40_000, opacity: 0.1, plain: false }
     }
 }
 

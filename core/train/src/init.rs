@@ -13,7 +13,8 @@ pub const SH_C0: f32 = 0.282_094_8;
 /// The dataset's points are enough where they are at least this share of the wanted ones; else others are looked for beside them.
 const ENOUGH: f64 = 0.1;
 
-/// Gaussians for `scene` as `config.init` wants them, at most `init.count` and `density.max_gaussians`. An [`Event::Note`] says where they come from.
+/// Gaussians for `scene` as `config.init` wants them, at most `init.count` and `density.max_gaussians`. With `init.plain` random points are grey, and no size
+/// and no opacity is limited. An [`Event::Note`] says where they come from.
 ///
 /// # Errors
 /// [`Error::Parameter`] and [`Error::Data`] where the scene has no points of that kind, and whatever decoding its images meets.
@@ -28,7 +29,7 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
     let own = scene.points.as_ref().filter(|p| !p.positions.is_empty());
     let mut uncertain = 0..0;
     let few = own.is_some_and(|points| (points.positions.len() as f64) < ENOUGH * count as f64);
-    let (points, mut message) = match (config.init.source, own) {
+    let (mut points, mut message) = match (config.init.source, own) {
         (InitSource::Auto, Some(points)) if few => {
             let found = find_points(scene, InitSource::Auto, count - points.positions.len(), seed)?;
             let own = points.positions.len();
@@ -58,13 +59,18 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
     if points.positions.is_empty() {
         return Err(Error::data(&scene.name, format!("init.source = {:?} found no points", config.init.source), "Use init.source = \"random\""));
     }
-    let mut host = from_points(&points, config.train.sh_degree, config.init.opacity);
-    let capped = limit_sizes(scene, &mut host);
-    if capped > 0 {
-        message += &format!("; {capped} made smaller, because each would cover much of an image");
+    if config.init.plain {
+        points.colors.iter_mut().skip(uncertain.start).take(uncertain.len()).for_each(|color| *color = [0.5; 3]);
     }
-    if let Some(opacity) = limit_opacities(scene, &mut host, uncertain) {
-        message += &format!("; the opacity of random ones lowered to {opacity:.3}, so that they do not hide each other");
+    let mut host = from_points(&points, config.train.sh_degree, config.init.opacity);
+    if !config.init.plain {
+        let capped = limit_sizes(scene, &mut host);
+        if capped > 0 {
+            message += &format!("; {capped} made smaller, because each would cover much of an image");
+        }
+        if let Some(opacity) = limit_opacities(scene, &mut host, uncertain) {
+            message += &format!("; the opacity of random ones lowered to {opacity:.3}, so that they do not hide each other");
+        }
     }
     events.emit(&Event::Note { object: "initial Gaussians".into(), message });
     Ok(host)

@@ -11,6 +11,7 @@ pub mod config;
 pub mod data;
 pub mod eval;
 pub mod event_log;
+mod field_box;
 pub mod gaussian_set;
 pub mod images;
 pub mod init;

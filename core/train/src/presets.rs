@@ -96,7 +96,7 @@ mod tests {
 
     #[test]
     fn embedding_grows_from_its_published_iterations_on() {
-        for (name, first) in [("n3dv+embedding", 5000), ("technicolor+embedding", 500)] {
+        for (name, first) in [("n3dv+embedding", 5000), ("technicolor+embedding", 500), ("dnerf+embedding", 501)] {
             let config = RunConfig::resolve(Some(name), None, &[]).unwrap();
             assert_eq!(config.train.shares, [0.0, 0.0, 1.0]);
             let from = config.density["from"].as_integer().unwrap();
@@ -114,6 +114,11 @@ mod tests {
             // Where none is stated, rounds end at 10,000, and there are no resets.
             let at = |key: &str| schedule.at(config.density.get(key).map_or(if key == "until" { 10_000 } else { 0 }, |v| v.as_integer().unwrap() as usize));
             assert!(at("reset_main_every").abs_diff(3000) <= 1, "{method}: {}", at("reset_main_every"));
+            let number = |key: &str| config.density.get(key).map_or(0, |v| v.as_integer().unwrap() as usize);
+            if method != "native-4d" {
+                let first_of_coarse = Schedule { stage: Stage::Coarse, ..Schedule::main(3000) }.at(number("coarse_from"));
+                assert_eq!((first_of_coarse, number("reset_every"), number("reset_main_first")), (500, 0, 1), "{method}: faint at the start of the main stage");
+            }
             // Rounded to reference iterations, and never so that one more reset is due.
             assert!((last - 2..=last).contains(&at("until")), "{method}: {}", at("until"));
         }
@@ -173,6 +178,28 @@ mod tests {
     }
 
     #[test]
+    fn published_methods_train_as_their_code_does() {
+        for family in ["dnerf", "n3dv", "technicolor"] {
+            for method in ["hexplane", "grid4d", "deform-mlp", "native-4d", "embedding", "swift4d"] {
+                let config = RunConfig::resolve(Some(&format!("{family}+{method}")), None, &[]).unwrap();
+                assert!(!config.train.guard && !config.train.sparse_adam && config.init.plain, "{family}+{method}");
+                let adam = (config.optimizer["new_rows"].as_float(), config.optimizer["restart_steps"].as_bool());
+                assert_eq!(adam, (Some(0.0), Some(false)), "{family}+{method}");
+            }
+        }
+        // 13,000 of the 20,000 iterations over which rates fall.
+        let swift4d = RunConfig::resolve(Some("n3dv+swift4d"), None, &[]).unwrap();
+        let main = Schedule { total: 21_000, ..Schedule::main(13_000) };
+        let at = |key: &str| main.at(swift4d.density[key].as_integer().unwrap() as usize);
+        assert_eq!(["from", "until", "weight_main_every"].map(at), [500, 10_000, 3000]);
+        let rate =
+            |stage: Stage, iteration: usize, length: usize| gaussian_rate(&swift4d.train.lr, "means", &Schedule { stage, iteration, ..Schedule::main(length) });
+        for (found, done) in [(rate(Stage::Main, 13_000, 13_000), 0.65), (rate(Stage::Coarse, 5000, 5000), 0.25)] {
+            assert!((found / (1.6e-4 * 0.01f64.powf(done)) - 1.0).abs() < 5e-3, "{found} after {done}");
+        }
+    }
+
+    #[test]
     fn rates_of_centres_go_on_where_the_published_schedule_is_one() {
         for (method, coarse, falls) in [("deform-mlp", 3000, 30_000.0), ("grid4d", 3000, 35_000.0), ("native-4d", 0, 30_000.0)] {
             let config = RunConfig::resolve(Some(&format!("dnerf+{method}")), None, &[]).unwrap();
@@ -190,13 +217,16 @@ mod tests {
     }
 
     #[test]
-    fn times_of_native_4d_are_shares_of_published_seconds() {
-        for (family, seconds) in [("n3dv", 10.0f64), ("dnerf", 1.0), ("technicolor", 50.0)] {
+    fn times_of_native_4d_are_those_of_the_published_code() {
+        // `time_duration`, and how many of its units the sequence has: on Technicolor times are shares.
+        for (family, time_duration, units) in [("n3dv", 10.0f64, 10.0), ("dnerf", 1.0, 1.0), ("technicolor", 50.0, 1.0)] {
             let config = RunConfig::resolve(Some(&format!("{family}+native-4d")), None, &[]).unwrap();
             // Where none is stated, the defaults of the deformer hold.
             let of = |key: &str, default: f64| config.deformer.get(key).map_or(default, |value| value.as_float().unwrap());
-            let (duration, rate) = (of("duration", 0.1414) * seconds, of("time_lr", 1.6e-5) * seconds);
-            assert!((duration / (seconds / 5.0).sqrt() - 1.0).abs() < 1e-3 && (rate / 1.6e-4 - 1.0).abs() < 1e-9, "{family}: {duration} s, {rate}");
+            let (duration, rate) = (of("duration", 0.1414) * units, of("time_lr", 1.6e-5) * units);
+            assert!((duration / (time_duration / 5.0).sqrt() - 1.0).abs() < 1e-3 && (rate / 1.6e-4 - 1.0).abs() < 1e-9, "{family}: {duration}, {rate}");
+            assert!((of("velocity_lr", 1e-3) / units / 2e-3 - 1.0).abs() < 1e-9 && config.deformer["velocity_extent"].as_bool() == Some(false), "{family}");
+            assert!((of("period", 1.0) * units / time_duration - 1.0).abs() < 1e-9, "{family}: cosines have the period of `time_duration`");
             assert_eq!(config.render.background, Some([0.0; 3]), "{family}");
             assert_eq!(config.density["max_scale_share"].as_float(), Some(0.1), "{family}");
             assert_eq!(config.density["max_scale_from"].as_integer(), Some(2001), "{family}: after 3,000 of 30,000");

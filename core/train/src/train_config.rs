@@ -1,5 +1,6 @@
 //! The configuration of the trainer, `[train]`.
 
+use crate::field_box::FieldBox;
 use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::{Error, Result, Schedule, Stage};
 use serde::{Deserialize, Serialize};
@@ -91,6 +92,15 @@ pub struct TrainConfig {
     pub recover: bool,
     /// Which Gaussians may move.
     pub dynamic: Dynamic,
+    /// The box in which the features of the deformer lie: `"moving"`, `"all"`, `"points"`, or a number h for a cube of the half width h around the origin of the
+    /// dataset, in its units.
+    pub field_box: FieldBox,
+    /// Judge removals of Gaussians and opacity resets on training views. Without, the plans of the density control are carried out as they are, and the trainer
+    /// removes only Gaussians with values that are not finite.
+    pub guard: bool,
+    /// Go on with the optimizer state of the Gaussians of the coarse stage in the main stage; dynamic scores, deformer, appearance and poses begin anew all the
+    /// same. Without, every stage begins with a new optimizer state.
+    pub keep_moments: bool,
     /// Step only the Gaussians that a view of the iteration shows.
     pub sparse_adam: bool,
     /// Iterations between two steps of the higher colour coefficients; the others compute no gradient of them.
@@ -135,6 +145,9 @@ impl Default for TrainConfig {
             key_frames: 0,
             recover: false,
             dynamic: Dynamic::Auto,
+            field_box: FieldBox::Moving,
+            guard: true,
+            keep_moments: false,
             sparse_adam: true,
             sh_every: 1,
             lr: GaussianRates::default(),
@@ -255,6 +268,11 @@ impl TrainConfig {
         }
         if !(0.0..=1.0).contains(&t.smooth_delta) {
             return bad("smooth_delta", format!("{} is not in 0..1", t.smooth_delta), "It is a share of the box and of the sequence; 0.005 is usual");
+        }
+        if let FieldBox::Cube(half) = t.field_box
+            && !(half > 0.0 && half.is_finite())
+        {
+            return bad("field_box", format!("{half} is not the half width of a cube"), "Give a positive number, \"moving\", \"all\" or \"points\"");
         }
         if !(0.1..=100.0).contains(&t.mask_sigma) {
             return bad("mask_sigma", format!("{} pixels", t.mask_sigma), "Give 0.1 to 100 pixels");

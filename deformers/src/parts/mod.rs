@@ -6,5 +6,6 @@ pub mod lives;
 pub mod neighbours;
 pub mod settings;
 pub mod tables;
+pub mod vectors;
 pub mod voxels;
 pub mod weights;

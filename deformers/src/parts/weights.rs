@@ -91,7 +91,8 @@ pub fn uniform(seed: Seed, count: usize, bound: f32) -> Vec<f32> {
     (0..count).map(|_| random.random_range(-bound..=bound)).collect()
 }
 
-/// A linear layer with Glorot weights and PyTorch's bias, as in 4DGS and E-D3DGS.
+/// A linear layer with Glorot weights and PyTorch's bias, as in 4DGS. The code of E-D3DGS defines this start, too, but never calls it: its layers start as
+/// [`torch`].
 pub fn glorot_with_bias(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     let bias = uniform(seed.child("bias"), output, 1.0 / (input.max(1) as f32).sqrt());
     glorot(seed.child("matrix"), input, output).into_iter().chain(bias).collect()

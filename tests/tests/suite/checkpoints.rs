@@ -8,6 +8,7 @@ use cc4dgs_play::checkpoint::{CHECKPOINT, CheckpointArrays, CheckpointFile, FORM
 use cc4dgs_train::checkpoint::load;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::train::{TrainJob, TrainReport, train};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -63,6 +64,63 @@ fn the_length_of_a_main_stage_may_be_set_until_it_is_settled() {
     // A length that was settled at another value is not given up either.
     stopped("stretched", &with("train.stretch=1.4"), 20);
     assert!(resumed("stretched", &sets).unwrap_err().to_string().contains("train.stretch was 1.4 and is 1.0"));
+}
+
+/// Stops a run before the first iteration of a stage.
+struct StopBefore<'a>(&'a str, &'a AtomicBool);
+
+impl EventSink for StopBefore<'_> {
+    fn emit(&self, event: &Event) {
+        if matches!(event, Event::StageStarted { stage, .. } if stage == self.0) {
+            self.1.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Centres of the Gaussians of a checkpoint as bits, each with its second moments.
+fn moments_of_centres(checkpoint: &Path) -> Vec<([u32; 3], Vec<f32>)> {
+    let file = CheckpointFile::read(checkpoint, &Limits::default()).unwrap();
+    let count = file.header::<serde_json::Value>().unwrap()["model"]["gaussians"].as_u64().unwrap() as usize;
+    let of = |name: &str| file.array(name, Some(3 * count)).unwrap();
+    let (means, second) = (of("gaussians/means"), of("optimizer/gaussians/means/second_moment"));
+    means.chunks_exact(3).zip(second.chunks_exact(3)).map(|(mean, second)| ([mean[0], mean[1], mean[2]].map(f32::to_bits), second.to_vec())).collect()
+}
+
+#[test]
+fn a_main_stage_goes_on_with_the_moments_of_the_coarse_one_where_it_is_told_to() {
+    let (folder, never) = (tempfile::tempdir().unwrap(), AtomicBool::new(false));
+    // 20, 20 and 2 iterations, in which no centre moves.
+    let still = ["train.lr.means=0", "train.lr.means_end=0", "density={kind='none'}", "train.dynamic=score", "train.zeta=0.1", "train.checks=false"];
+    let sets = [&["init.count=200", "train.iterations=42", "train.shares=[10,10,1]"][..], &still].concat();
+    let kept = [&sets[..], &["train.keep_moments=true"]].concat();
+    let path = |name: &str| folder.path().join(name).join(CHECKPOINT);
+    let steps = |name: &str| {
+        let header = CheckpointFile::read(&path(name), &Limits::default()).unwrap().header::<serde_json::Value>().unwrap();
+        let steps = &header["training"]["optimizer_steps"];
+        (steps["gaussians/means"].as_u64().unwrap(), steps.get("gaussians/dynamic_scores").is_some())
+    };
+    run(&folder.path().join("anew"), &sets, false, &Silent, &never).unwrap();
+    assert_eq!(steps("anew"), (2, false));
+    run(&folder.path().join("whole"), &kept, false, &Silent, &never).unwrap();
+    assert_eq!(steps("whole"), (22, false));
+
+    // The state survives an interruption between the stages.
+    let stop = AtomicBool::new(false);
+    let interrupted = run(&folder.path().join("stopped"), &kept, false, &StopBefore("score", &stop), &stop);
+    assert!(matches!(interrupted, Err(Error::Interrupted(_))), "{interrupted:?}");
+    assert_eq!(steps("stopped"), (20, false));
+    let coarse = moments_of_centres(&path("stopped"));
+    run(&folder.path().join("stopped"), &kept, true, &Silent, &never).unwrap();
+    assert!(std::fs::read(path("stopped")).unwrap() == std::fs::read(path("whole")).unwrap());
+
+    // What moves is first by then, and every centre has its own moments: two steps take 0.2 % of them.
+    let main = moments_of_centres(&path("whole"));
+    assert!(main.len() == coarse.len() && main.iter().zip(&coarse).any(|(now, then)| now.0 != then.0), "the order is the same");
+    let of_coarse: BTreeMap<[u32; 3], Vec<f32>> = coarse.into_iter().collect();
+    for (mean, now) in main {
+        let then = &of_coarse[&mean];
+        assert!(now.iter().zip(then).all(|(now, then)| *now >= 0.99 * then), "{now:?} now, {then:?} after the coarse stage");
+    }
 }
 
 /// The images of a scene, which cannot be read while the flag is set.

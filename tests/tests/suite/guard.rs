@@ -40,8 +40,9 @@ struct Done {
 static DONE: Mutex<Vec<(String, Arc<Done>)>> = Mutex::new(Vec::new());
 
 /// Does harm after every iteration: `does = "remove"` keeps a single Gaussian, `"reset"` makes all nearly transparent, `"children"` adds copies and removes
-/// those of the iteration before, `"dazzle"` makes all far too bright in the last tenth of the main stage, which no guard prevents. The default does nothing,
-/// because other tests run every registered control.
+/// those of the iteration before, `"dazzle"` makes all far too bright in the last tenth of the main stage, which no guard prevents. `"halve"` removes every
+/// second one in the first iteration of the coarse stage and makes the others nearly transparent. The default does nothing, because other tests run every
+/// registered control.
 struct Hostile {
     does: String,
     done: Option<Arc<Done>>,
@@ -79,6 +80,14 @@ impl DensityControl for Hostile {
             "remove" => {
                 plan = DensityPlan::new();
                 plan.keep(0);
+            }
+            "halve" if schedule.stage == Stage::Coarse && schedule.iteration == 1 => {
+                plan = DensityPlan::new();
+                (0..count).step_by(2).for_each(|row| {
+                    let kept = plan.keep(row);
+                    plan.set(kept, "opacity_logits", &[-6.0]);
+                });
+                plan.restart("opacity_logits");
             }
             "reset" => {
                 (0..count).for_each(|row| plan.set(row, "opacity_logits", &[-6.0]));
@@ -164,12 +173,17 @@ fn configured(does: &str, iterations: usize) -> RunConfig {
 }
 
 fn run(does: &str, iterations: usize) -> Run {
+    run_with(&configured(does, iterations), does, iterations)
+}
+
+/// A training with `config`, whose control does what `does` says.
+fn run_with(config: &RunConfig, does: &str, iterations: usize) -> Run {
     let done = Arc::new(Done::default());
     DONE.lock().unwrap().push((does.into(), done.clone()));
-    let (registry, config) = (Registry::collect().unwrap(), configured(does, iterations));
+    let registry = Registry::collect().unwrap();
     let scene = Arc::new(cc4dgs_train::data::open(Path::new("procedural:tiny"), &config.scene, &registry, &config.limits).unwrap());
     let (events, stop) = (Recorder::default(), AtomicBool::new(false));
-    let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &events, stop: &stop, observer: None };
+    let job = TrainJob { config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &events, stop: &stop, observer: None };
     let model = train(&job).unwrap().0;
     let scored = Scored { max_views: 6, ..Scored::all(Split::Train) };
     let psnr_db = evaluate(&model, &scene, scored, &registry, &Device::flex(), &cc4dgs_core::Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
@@ -208,6 +222,18 @@ fn hostile_controls_do_not_take_a_training_apart() {
                 _ => assert!(count(|d| &d.added) > 0 && count(|d| &d.removed) > 0 && run.ended >= run.begun),
             }
         }
+    }
+}
+
+#[test]
+fn plans_are_carried_out_as_they_are_without_the_guard() {
+    for guard in [true, false] {
+        let mut config = configured("halve", 30);
+        config.train.guard = guard;
+        let run = run_with(&config, "halve", 30);
+        let [removed, resets] = [&run.done.removed, &run.done.resets].map(|count| count.load(SeqCst));
+        let expected = if guard { (0, 0, run.begun) } else { (run.begun / 2, 1, run.begun - run.begun / 2) };
+        assert_eq!((removed, resets, run.ended), expected, "guard = {guard}, {:?}", run.notes);
     }
 }
 

@@ -80,12 +80,13 @@ impl Context<'_> {
         self.guard_reset(state, schedule)
     }
 
-    /// Puts what moves first, where a stage begins with new statistics and a new optimizer state.
+    /// Puts what moves first, where a stage begins with new statistics. The optimizer state follows: [`TrainState::begin_stage`] may keep it.
     pub(super) fn order_rows(&self, state: &mut TrainState) -> Result<()> {
         let mut plan = DensityPlan::unchanged(state.set.len());
         moving_first(&mut plan, state)?;
         if !plan.keeps_all(state.set.len()) {
             state.set = GaussianSet::from_gaussians(&plan.apply(&state.set.gaussians()?)?);
+            state.optimizer.select_rows("gaussians/", plan.parents(), plan.fresh())?;
             state.invalidate_rows();
         }
         Ok(())
@@ -101,7 +102,7 @@ impl Context<'_> {
         }
         if !state.guard.counts(broken.len()) {
             // No stage had an iteration before this one: guard and control know of no Gaussian yet.
-            state.begin_stage(&self.device);
+            state.begin_stage(self.job.config.train.keep_moments, &self.device)?;
         }
         let mut plan = DensityPlan::new();
         (0..broken.len()).filter(|&row| !broken[row]).for_each(|row| {

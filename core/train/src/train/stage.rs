@@ -9,7 +9,7 @@ use super::{Context, TrainState};
 use crate::checkpoint;
 use crate::checks::Watch;
 use crate::config::CoarseFrames;
-use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage, start_deformer};
+use cc4dgs_core::{DeformerContext, Error, Event, Result, Schedule, Split, Stage, start_deformer};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use std::collections::BTreeMap;
@@ -38,7 +38,7 @@ impl Context<'_> {
                 self.remove_broken(state)?;
                 self.order_rows(state)?;
             }
-            state.begin_stage(&self.device);
+            state.begin_stage(self.job.config.train.keep_moments, &self.device)?;
             if stage == Stage::Main {
                 self.begin_main(state)?;
                 // Images are read before anything is added: a run from here adds all of them.
@@ -192,10 +192,12 @@ impl Context<'_> {
         if of_first.len() >= 2 { of_first } else { all }
     }
 
-    /// The deformer of a `[deformer]` section, over the box of what moves and started from it.
+    /// The deformer of a `[deformer]` section, over the box of `train.field_box` and started from what moves.
     pub(super) fn new_deformer(&self, state: &TrainState, section: toml::Table) -> Result<ModelDeformer> {
         let first = state.moving_gaussians()?;
-        let context = state.field_context(&first, self.job.scene.frame_count, self.seed.child("field"));
+        let [box_min, box_max] = self.job.config.train.field_box.corners(&first, || state.finite_gaussians(), &self.job.scene)?;
+        let (frame_count, sh_degree) = (self.job.scene.frame_count, state.set.sh_degree);
+        let context = DeformerContext { box_min, box_max, frame_count, sh_degree, seed: self.seed.child("field") };
         let field = self.job.registry.build_deformer(&section, &context, &self.device)?;
         let mut deformer = ModelDeformer { field, section, context };
         let name = deformer.name().to_string();

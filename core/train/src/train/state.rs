@@ -10,9 +10,7 @@ use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{
-    Appearance, DeformerContext, DensityControl, HostGaussians, Optimizer, Parameter, Poses, Result, Scene, Seed, Similarity, SpatialInput, Split, Stage,
-};
+use cc4dgs_core::{Appearance, DensityControl, HostGaussians, Optimizer, Parameter, Poses, Result, Scene, Similarity, SpatialInput, Split, Stage, path_holds};
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Moving, MovingRows, RenderConfig};
 
@@ -109,11 +107,26 @@ impl TrainState {
     pub fn render(&self, config: &RunConfig) -> RenderConfig {
         RenderConfig { focal: config.render.focal.or(self.focal), ..config.render.clone() }
     }
-    /// New optimizer state and statistics, as every stage starts with (Swift4D).
-    pub fn begin_stage(&mut self, device: &Device) {
+    /// New optimizer state and statistics, as every stage starts with (Swift4D). With `keep_moments` the attributes of the Gaussians keep their optimizer state
+    /// after the coarse stage, but for the dynamic scores, which only the score stage fits. A stage that has begun and has no iteration may begin again.
+    ///
+    /// # Errors
+    /// What the optimizer reports where it restores the state that is kept.
+    pub fn begin_stage(&mut self, keep_moments: bool, device: &Device) -> Result<()> {
+        let kept = (keep_moments && self.stage != Stage::Coarse).then(|| {
+            let mut kept = self.optimizer.state();
+            let goes_on = |name: &str| path_holds("gaussians", name) && !path_holds("gaussians/dynamic_scores", name);
+            kept.arrays.retain(|name, _| goes_on(name));
+            kept.steps.retain(|name, _| goes_on(name));
+            kept
+        });
         self.optimizer.restart("");
+        if let Some(kept) = kept {
+            self.optimizer.restore(kept)?;
+        }
         self.density.begin_stage(self.set.len(), device);
         self.guard.begin_stage(self.set.len());
+        Ok(())
     }
     /// The weights of the parts that learn of cameras, by the name of the part.
     pub(crate) fn of_cameras(&self) -> [(&'static str, Vec<&Parameter>); 2] {
@@ -166,18 +179,10 @@ impl TrainState {
         rows.retain(|&row| host.is_finite(row));
         Ok(host.select(&rows))
     }
-    /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres of `first`, padded by 5 %.
-    pub fn field_context(&self, first: &HostGaussians, frame_count: usize, seed: Seed) -> DeformerContext {
-        let (mut box_min, mut box_max) = ([0.0f32; 3], [0.0f32; 3]);
-        for k in 0..3 {
-            let mut values: Vec<f32> = first.means.iter().skip(k).step_by(3).copied().collect();
-            values.sort_unstable_by(f32::total_cmp);
-            let pick = |share: f64| values.get((values.len().saturating_sub(1) as f64 * share).round() as usize).copied().unwrap_or(0.0);
-            let (low, high) = (pick(0.001), pick(0.999));
-            // A flat axis still needs a width to be normalised by.
-            let pad = (0.05 * (high - low)).max(1e-4 * (1.0 + low.abs().max(high.abs())));
-            (box_min[k], box_max[k]) = (low - pad, high + pad);
-        }
-        DeformerContext { box_min, box_max, frame_count, sh_degree: self.set.sh_degree, seed }
+    /// All Gaussians, without those that are not finite.
+    pub fn finite_gaussians(&self) -> Result<HostGaussians> {
+        let host = self.set.host_gaussians()?;
+        let rows: Vec<usize> = (0..host.len()).filter(|&row| host.is_finite(row)).collect();
+        Ok(host.select(&rows))
     }
 }

@@ -13,6 +13,7 @@ use serde::Deserialize;
 
 const SCHEMA: &str = "\
 from = 500               # first round, in reference iterations of the stage (coarse 5,000, main 20,000)
+coarse_from = 0          # that of the coarse stage; 0: the same number
 until = 10000            # last round, in reference iterations of the main stage; the coarse stage ends at 5,000
 every = 100              # reference iterations between two rounds
 gradient = 2e-4          # mean screen gradient, in normalised device units, from which a Gaussian is cloned or split
@@ -22,8 +23,11 @@ dense_share = 0.01       # largest size that is cloned instead of split, as a sh
 min_opacity = 0.005      # fainter Gaussians are removed
 max_scale_share = 0.0    # larger Gaussians are removed, as a share of the extent; 0 is off
 max_scale_from = 0       # first reference iteration of the main stage at which they are; 0: in all of it and in the coarse stage
+prune_from = 0           # the same for faint Gaussians, and for large ones
+prune_above = 0          # faint and large Gaussians are removed only where there are more Gaussians than this
 min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
 weight_every = 3000      # reference iterations between two weight prunings; 0 is off
+weight_main_every = 0    # those of the main stage; 0: the same number
 reset_every = 3000       # reference iterations between two opacity resets of the coarse stage, to 0.01 or twice min_opacity; 0 is off
 reset_main_every = 0     # the same in the main stage, until the last round, in reference iterations of that stage; 0 is off
 reset_main_first = 0     # the first of these, in the same iterations; 0: after the interval
@@ -47,6 +51,7 @@ const MIN_INTERVAL: usize = 25;
 #[serde(deny_unknown_fields, default)]
 struct Settings {
     from: usize,
+    coarse_from: usize,
     until: usize,
     every: usize,
     gradient: f32,
@@ -56,8 +61,11 @@ struct Settings {
     min_opacity: f32,
     max_scale_share: f32,
     max_scale_from: usize,
+    prune_from: usize,
+    prune_above: usize,
     min_weight: f32,
     weight_every: usize,
+    weight_main_every: usize,
     reset_every: usize,
     reset_main_every: usize,
     reset_main_first: usize,
@@ -68,6 +76,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             from: 500,
+            coarse_from: 0,
             until: 10_000,
             every: 100,
             gradient: 2e-4,
@@ -77,8 +86,11 @@ impl Default for Settings {
             min_opacity: 0.005,
             max_scale_share: 0.0,
             max_scale_from: 0,
+            prune_from: 0,
+            prune_above: 0,
             min_weight: 0.02,
             weight_every: 3000,
+            weight_main_every: 0,
             reset_every: 3000,
             reset_main_every: 0,
             reset_main_first: 0,
@@ -97,8 +109,15 @@ impl Settings {
         let kept = 2.0 * self.min_opacity;
         if kept > RESET_OPACITY { logit(kept.min(MOST_RESET_OPACITY)) } else { logit(RESET_OPACITY) }
     }
-    fn weight_interval(&self, schedule: &Schedule) -> usize {
-        schedule.at(self.weight_every).max(MIN_WEIGHT_INTERVAL).max(WEIGHT_PASSES * schedule.pass)
+    /// Iterations between two weight prunings; `None` where there are none.
+    fn weight_interval(&self, schedule: &Schedule) -> Option<usize> {
+        let own = schedule.stage == Stage::Main && self.weight_main_every > 0;
+        let every = if own { self.weight_main_every } else { self.weight_every };
+        (every > 0).then(|| schedule.at(every).max(MIN_WEIGHT_INTERVAL).max(WEIGHT_PASSES * schedule.pass))
+    }
+    /// Whether a rule of removal that begins at the reference iteration `from` of the main stage holds.
+    fn removes(schedule: &Schedule, from: usize) -> bool {
+        from == 0 || (schedule.stage == Stage::Main && schedule.iteration >= schedule.at(from))
     }
     /// The actions due after this iteration.
     fn due(&self, schedule: &Schedule) -> Due {
@@ -108,13 +127,14 @@ impl Settings {
             _ => (self.reset_main_every, self.reset_main_first, end),
         };
         let first = schedule.at(if first == 0 { every } else { first });
+        let from = if schedule.stage == Stage::Coarse && self.coarse_from > 0 { self.coarse_from } else { self.from };
         let resets = every > 0 && (first..until).contains(&iteration) && (iteration - first).is_multiple_of(schedule.at(every).max(1));
         Due {
-            grow: iteration > schedule.at(self.from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
-            prune_weight: self.weight_every > 0 && iteration < end && iteration.is_multiple_of(self.weight_interval(schedule)),
+            grow: iteration > schedule.at(from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
+            prune_weight: iteration < end && self.weight_interval(schedule).is_some_and(|interval| iteration.is_multiple_of(interval)),
             reset: resets && schedule.left() >= MIN_RECOVERY,
-            prune_large: self.max_scale_share > 0.0
-                && (self.max_scale_from == 0 || (schedule.stage == Stage::Main && iteration >= schedule.at(self.max_scale_from))),
+            prune_faint: Self::removes(schedule, self.prune_from),
+            prune_large: self.max_scale_share > 0.0 && Self::removes(schedule, self.prune_from.max(self.max_scale_from)),
             held: 0,
         }
     }
@@ -140,8 +160,7 @@ impl DensityControl for CloneSplit {
             wanted.push(if self.settings.absolute { Statistic::AbsoluteScreenGradient } else { Statistic::ScreenGradient });
         }
         // Blending weights are collected until the last weight pruning.
-        let interval = self.settings.weight_interval(schedule);
-        if self.settings.weight_every > 0 && schedule.iteration.div_ceil(interval) * interval < end {
+        if self.settings.weight_interval(schedule).is_some_and(|interval| schedule.iteration.div_ceil(interval) * interval < end) {
             wanted.push(Statistic::MaxWeight);
         }
         wanted
@@ -264,15 +283,38 @@ mod tests {
     }
 
     #[test]
-    fn large_gaussians_are_removed_from_the_iteration_on_that_is_set() {
+    fn gaussians_are_removed_from_the_iteration_on_that_is_set() {
+        // Faint and large ones.
         let due = |text: &str, stage: Stage, iteration: usize| {
             let settings: Settings = toml::from_str(text).unwrap();
-            settings.due(&Schedule { stage, iteration, total: 40_000, ..Schedule::main(30_000) }).prune_large
+            let due = settings.due(&Schedule { stage, iteration, total: 40_000, ..Schedule::main(30_000) });
+            (due.prune_faint, due.prune_large)
         };
-        assert!(!due("", Stage::Main, 5000));
-        assert!(due("max_scale_share = 0.1", Stage::Coarse, 600) && due("max_scale_share = 0.1", Stage::Main, 600));
+        assert_eq!(due("", Stage::Main, 5000), (true, false));
+        assert!(due("max_scale_share = 0.1", Stage::Coarse, 600).1 && due("max_scale_share = 0.1", Stage::Main, 600).1);
         let later = "max_scale_share = 0.1\nmax_scale_from = 2000";
-        assert!(!due(later, Stage::Coarse, 5000) && !due(later, Stage::Main, 2999) && due(later, Stage::Main, 3000));
+        assert_eq!(
+            [(Stage::Coarse, 5000), (Stage::Main, 2999), (Stage::Main, 3000)].map(|(stage, at)| due(later, stage, at)),
+            [(true, false), (true, false), (true, true)]
+        );
+        let both = "max_scale_share = 0.1\nprune_from = 2000";
+        assert_eq!(
+            [(Stage::Coarse, 5000), (Stage::Main, 2999), (Stage::Main, 3000)].map(|(stage, at)| due(both, stage, at)),
+            [(false, false), (false, false), (true, true)]
+        );
+    }
+
+    #[test]
+    fn the_coarse_stage_has_a_first_round_and_the_main_stage_an_interval_of_weight_prunings_of_its_own() {
+        let text = "from = 0\ncoarse_from = 833\nweight_every = 3000\nweight_main_every = 4615\nuntil = 15385";
+        let at = |stage: Stage, length: usize| {
+            let settings: Settings = toml::from_str(text).unwrap();
+            let due = |iteration: usize| settings.due(&Schedule { stage, iteration, total: 28_000, ..Schedule::main(length) });
+            let first = (1..=length).find(|&iteration| due(iteration).grow);
+            (first, (1..=length).filter(|&iteration| due(iteration).prune_weight).collect::<Vec<_>>())
+        };
+        assert_eq!(at(Stage::Coarse, 3000), (Some(600), vec![1800]));
+        assert_eq!(at(Stage::Main, 13_000), (Some(100), vec![3000, 6000, 9000]));
     }
 
     #[test]

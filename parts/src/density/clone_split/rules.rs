@@ -24,6 +24,8 @@ pub(super) struct Due {
     pub prune_weight: bool,
     /// Lower all opacities.
     pub reset: bool,
+    /// Remove faint Gaussians.
+    pub prune_faint: bool,
     /// Remove large Gaussians.
     pub prune_large: bool,
     /// How many of `max_gaussians` growth must leave unused.
@@ -41,7 +43,9 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
     let largest = |i: usize| host.log_scales[3 * i..3 * i + 3].iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)).exp();
     let opacity = |i: usize| 1.0 / (1.0 + (-host.opacity_logits[i]).exp());
     let weak = |i: usize| due.prune_weight && weight[i] < settings.min_weight;
-    let dead = |i: usize| !host.is_finite(i) || opacity(i) < settings.min_opacity || (due.prune_large && largest(i) > settings.max_scale_share * extent);
+    let prunes = n > settings.prune_above;
+    let dead = |i: usize| !host.is_finite(i) || (prunes && due.prune_faint && opacity(i) < settings.min_opacity);
+    let too_large = |size: f32| prunes && due.prune_large && size > settings.max_scale_share * extent;
 
     let correct = |plan: &mut DensityPlan, row: usize, of: usize| {
         // A reset sets all opacities, and the trainer may leave it out.
@@ -64,7 +68,10 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
             plan.report.removed += 1;
             continue;
         }
-        if !grows {
+        // What splits is judged by the size of its halves.
+        if too_large(if grows { largest(i) / SPLIT_SHRINK } else { largest(i) }) {
+            plan.report.removed += 1;
+        } else if !grows {
             plan.keep(i);
         } else if largest(i) <= settings.dense_share * extent {
             let row = plan.keep(i);
@@ -173,7 +180,7 @@ mod tests {
         host.opacity_logits[2] = -20.0;
         let mut statistics = Statistics::zeros(4, &device);
         statistics.gradients = Tensor::from_floats([[1.0, 1.0], [1.0, 1.0], [1.0, 1.0], [0.0, 1.0]], &device);
-        let due = Due { grow: true, ..Default::default() };
+        let due = Due { grow: true, prune_faint: true, ..Default::default() };
         let plan = round(&Settings::default(), &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
         assert_eq!((plan.report.cloned, plan.report.split, plan.report.removed), (1, 1, 1));
         assert_eq!(to_vec(statistics.after(&plan, false, &device).unwrap().max_weight, "weights").unwrap(), [0.0, 0.0, 1.0, 1.0, 1.0]);
@@ -183,6 +190,24 @@ mod tests {
         assert_eq!(after.extra["label"].values, vec![0.0, 3.0, 0.0, 1.0, 1.0]);
         assert!((after.log_scales[9] + SPLIT_SHRINK.ln()).abs() < 1e-6);
         assert_ne!(after.means[9..12], after.means[12..15], "the two halves are different samples");
+    }
+
+    #[test]
+    fn large_gaussians_are_removed_after_they_were_split() {
+        let device = Device::flex();
+        let mut host = host_of(4);
+        // 0 is kept, 1 splits into halves that are small enough, 2 does not grow and is too large, and so are the halves of 3.
+        host.log_scales = [0.01f32, 0.15, 0.15, 0.3].iter().flat_map(|size| [size.ln(); 3]).collect();
+        let mut statistics = Statistics::zeros(4, &device);
+        statistics.gradients = Tensor::from_floats([[0.0, 1.0], [1.0, 1.0], [0.0, 1.0], [1.0, 1.0]], &device);
+        let planned = |prune_above: usize| {
+            let settings = Settings { max_scale_share: 0.1, prune_above, ..Settings::default() };
+            let due = Due { grow: true, prune_large: true, ..Default::default() };
+            round(&settings, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap()
+        };
+        let plan = planned(3);
+        assert_eq!((plan.parents(), plan.report.removed, plan.report.split), (&[0, 1, 1][..], 2, 1));
+        assert_eq!((planned(4).parents(), planned(4).report.removed), (&[0, 2, 1, 1, 3, 3][..], 0));
     }
 
     #[test]

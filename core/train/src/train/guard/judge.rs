@@ -43,10 +43,20 @@ impl Probes {
 }
 
 impl Context<'_> {
-    /// Weakens what `plan` removes, remembers what it resets, and puts what moves first. Call before the plan is carried out.
+    /// Weakens what `plan` removes and remembers what it resets, unless `train.guard` is off, and puts what moves first. Call before the plan is carried out.
     pub(crate) fn guard_plan(&self, plan: &mut DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
-        let (count, own) = (state.set.len(), plan.len());
         state.guard.read_views()?;
+        if self.job.config.train.guard {
+            self.judge_plan(plan, state, schedule)?;
+        }
+        moving_first(plan, state)?;
+        state.guard.follow(plan, schedule.iteration);
+        Ok(())
+    }
+
+    /// Weakens what `plan` removes and remembers what it resets.
+    fn judge_plan(&self, plan: &mut DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let (count, own) = (state.set.len(), plan.len());
         let removed = plan.removed(count);
         if !removed.is_empty() || state.guard.held > 0 {
             let logits = to_vec(state.set.get(OPACITIES)?.clone(), OPACITIES)?;
@@ -63,8 +73,6 @@ impl Context<'_> {
                 *plan = without_reset(plan);
             }
         }
-        moving_first(plan, state)?;
-        state.guard.follow(plan, schedule.iteration);
         Ok(())
     }
 
@@ -152,7 +160,7 @@ impl Context<'_> {
         self.job.events.emit(&Event::Note { object: "density control".into(), message });
     }
 
-    /// Judges the last opacity reset once its time is over; at the end of the stage in any case.
+    /// Judges the last opacity reset once its time is over; at the end of the stage in any case. Without `train.guard` there is none to judge.
     pub(crate) fn guard_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let Some(reset) = &state.guard.reset else { return Ok(()) };
         let due = reset.iteration + recovery(schedule);

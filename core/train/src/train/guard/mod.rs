@@ -1,4 +1,5 @@
-//! Keeps density control from destroying what is already fitted, whatever the control.
+//! Keeps density control from destroying what is already fitted, whatever the control. `train.guard = false` switches all of it off: plans are then carried out
+//! as they are.
 //!
 //! - Gaussians with values that are not finite always go. Of the others:
 //! - Nothing is removed before the cameras of the stage had two passes to fit it, or a sixth of the stage: not at its beginning, and no Gaussian that is
