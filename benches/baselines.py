@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """Every baseline at its published size and rates for the same wall time: how far it comes, and the curve.
 
-    python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N] [--processor]
+    python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N] [--processor] [--width 800]
 
-Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800) and interrupts it after --minutes of training. What it has learned until then is evaluated once
-on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Presets have
-the background that a method is published on. Results are in OUT/rows.json, one row per method: iterations
-reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With --jobs 2 --threads 1 two methods share the machine.
+Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800, or --width: the configurations of `native-4d` train at 400) and
+interrupts it after --minutes of training. What it has learned until then is evaluated once on the test views; its learning rates have not
+fallen yet, so this is no figure of a finished training. Presets have the background that a method is published on. Results are in
+OUT/rows.json, one row per method: iterations reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With
+--jobs 2 --threads 1 two methods share the machine.
 --processor counts minutes of processor time, all threads of a training together, instead of those on the clock: nothing is lost while a training is stopped (SIGSTOP)
 or waits for others. Seconds of the curve are those on the clock.
 
@@ -75,7 +76,7 @@ def row(options, stated):
     if resumed:
         arguments += ["--resume"]
     else:
-        arguments += ["--overwrite", "--preset", f"dnerf+{method}", "--set", "scene.width=800", "--set", "train.checkpoint_every=500"]
+        arguments += ["--overwrite", "--preset", f"dnerf+{method}", "--set", f"scene.width={options.width}", "--set", "train.checkpoint_every=500"]
     if options.threads:
         arguments += ["--threads", str(options.threads)]
     clock = options.out / f"{name}.processor"
@@ -122,6 +123,7 @@ def main():
     parser.add_argument("--only", default=",".join(METHODS))
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--width", type=int, default=800, help="pixels of the images")
     parser.add_argument("--processor", action="store_true", help="minutes of processor time")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -132,6 +134,8 @@ def main():
         stated = {"method": method, "path": str(options.scene), "minutes": options.minutes, "threads": options.threads, "jobs": options.jobs}
         if options.processor:
             stated["clock"] = "processor"
+        if options.width != 800:
+            stated["width"] = options.width
         stated |= {"binary_sha256": sha256(options.bin)}
         if rows.find(stated):
             return True
