@@ -38,8 +38,8 @@ pub trait Optimizer: Send {
     /// values are rounded, `value` is 0 and the caller adds the step to the values, in units of their quantisation steps: terms that depend on the size of
     /// values, such as weight decay, have no effect there.
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
-    /// Removes the state of all arrays that `path` holds ([`path_holds`]). By a setting of its own an optimizer may keep its count of steps where `path` is the name
-    /// of one array.
+    /// Removes the state of all arrays that `path` holds ([`path_holds`]). By a setting of its own an optimizer may keep its count of steps where `path` is the
+    /// name of one array.
     fn restart(&mut self, path: &str);
     /// Reorders the state of the arrays that `path` holds ([`path_holds`]): row i is a copy of the old row `parents[i]`. Where `fresh[i]` is set, it starts
     /// without momentum, but its steps have the size of its parent's, unless a setting of the optimizer says otherwise.

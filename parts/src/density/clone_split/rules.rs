@@ -9,8 +9,8 @@ use rand::Rng;
 
 /// The two halves of a split are smaller by this factor (3DGS: 0.8 times 2).
 const SPLIT_SHRINK: f32 = 1.6;
-/// Farthest time from that of its parent at which the half of a split is, in sequences. What lasts longer is there at all times, and a path that is written down
-/// from far away loses digits.
+/// Farthest time from that of its parent at which the half of a split is, in sequences. What lasts longer is there at all times, and a path that is written
+/// down from far away loses digits.
 const FARTHEST: f32 = 10.0;
 /// Largest logarithm of a duration whose exponential is used.
 const MOST_LOG_DURATION: f32 = 30.0;
